@@ -1,0 +1,87 @@
+"""The command line: `fgtutor COMMAND --options`, where tyro reads each command's own dataclass.
+
+A command is a module that offers a frozen dataclass and `run(config) -> int | None`. It is imported
+only when chosen, so that `fgtutor --help` answers at once.
+"""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from fgtutor import __version__
+from fgtutor.errors import FgtutorError
+
+COMMANDS = {
+    "demo": ("demo", "DemoConfig", "plan over a mixed terrain and drive it with the toy robot"),
+    "train": ("training", "TrainConfig", "train a specialist with its Feasibility-Net"),
+    "plan": ("pipeline", "PlanConfig", "plan a route over a map file"),
+    "evaluate matrix": (
+        "evaluation.matrix",
+        "MatrixConfig",
+        "drive every policy, and ours, over every terrain",
+    ),
+    "evaluate calibration": (
+        "evaluation.calibration",
+        "CalibrationConfig",
+        "compare every Feasibility-Net with what its policy does on new terrain",
+    ),
+    "doctor": ("doctor", "DoctorConfig", "say what this machine has, lacks and needs"),
+}
+"""Command: module under fgtutor, its config dataclass, what it is for."""
+
+USAGE, INTERRUPTED = 2, 130
+"""Exit codes: a mistake that the message explains; Ctrl-C (128 + SIGINT, as shells report it)."""
+
+
+def overview() -> str:
+    """Return the list of commands."""
+    rows = (f"  {name:<20} {what}" for name, (_, _, what) in COMMANDS.items())
+    return "\n".join(
+        [
+            f"fgtutor {__version__}: feasibility-guided planning over locomotion specialists",
+            "",
+            "usage: fgtutor COMMAND [--help] [--options]",
+            "",
+            *rows,
+        ]
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return the exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    command = next((name for name in COMMANDS if words[: len(name.split())] == name.split()), None)
+    if command is not None:
+        return _run(command, words[len(command.split()) :])
+    if words == ["--version"]:
+        print(__version__)
+        return 0
+    if not words or words[-1] in ("-h", "--help"):
+        print(overview())
+        return 0
+    print(
+        f"fgtutor: no command {' '.join(words[:2])!r}; the commands are {', '.join(COMMANDS)}",
+        file=sys.stderr,
+    )
+    return USAGE
+
+
+def _run(command: str, options: Sequence[str]) -> int:
+    """Import a command's module, let tyro fill its dataclass, and run it."""
+    import tyro  # here, because `fgtutor --help` needs none of it
+
+    module_name, config_name, _ = COMMANDS[command]
+    try:
+        module = importlib.import_module(f"fgtutor.{module_name}")
+        config = tyro.cli(getattr(module, config_name), args=options, prog=f"fgtutor {command}")
+        return module.run(config) or 0
+    except FgtutorError as error:
+        print(f"fgtutor {command}: {error}", file=sys.stderr)
+        return USAGE
+    except KeyboardInterrupt:
+        print(f"fgtutor {command}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+"""Writing files so that a reader sees the old file or the new one, never half of either.
+
+Reads nothing; gives a temporary path in the target's own folder and moves it into place with one
+`os.replace`, which is atomic within a file system (POSIX rename; Windows MoveFileEx).
+"""
+
+import errno
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from fgtutor.errors import StorageError
+
+_ADVICE = {
+    errno.ENOSPC: "free some disk space and save again",
+    errno.EDQUOT: "your disk quota is used up: free some space and save again",
+    errno.EFBIG: "the file is larger than this system allows: save a smaller one",
+    errno.EACCES: "choose a folder that you may write to",
+    errno.EPERM: "choose a folder that you may write to",
+    errno.EROFS: "the file system is read-only: choose another folder",
+    errno.ENOENT: "create the folder first",
+    errno.ENOTDIR: "a part of the path is a file, not a folder: choose another path",
+    errno.EISDIR: "the path is a folder: give the name of a file in it",
+}
+
+
+@contextmanager
+def atomic_write(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; move it to `path` once the block has succeeded.
+
+    The block creates and writes the temporary file (it keeps the suffix, for writers that look at
+    it). If the block or the move fails, the temporary file is removed and `path` is as it was.
+
+    Raises:
+        StorageError: The system refused to write (full disk, read-only or missing folder).
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    try:
+        try:
+            yield temporary
+            # Data must reach the disk before the name does, or a power cut leaves an empty file.
+            with temporary.open("r+b") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink()
+            raise
+    except OSError as error:
+        raise storage_error(path, error) from error
+
+
+def check_writable(path: str | Path) -> None:
+    """Raise `StorageError` now if `path` could not be written later, when the work is done."""
+    path = Path(path)
+    probe = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.probe")
+    try:
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise storage_error(path, error) from error
+
+
+def make_folder(path: str | Path) -> None:
+    """Create a folder and its parents; raises `StorageError` if the system refuses."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise storage_error(path, error) from error
+
+
+def storage_error(path: str | Path, error: OSError) -> StorageError:
+    """Return a `StorageError` that names the path, the system's reason and what to do about it."""
+    advice = _ADVICE.get(error.errno or 0, "check the path and the disk, then save again")
+    return StorageError(
+        f"cannot write {path}: {error.strerror or error}; {advice} (nothing partial was left)"
+    )

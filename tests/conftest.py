@@ -1,0 +1,104 @@
+"""What every test starts from: one thread, no window, and a small specialist made on the spot."""
+
+import math
+import os
+from collections.abc import Callable
+
+# Before anything imports matplotlib or GitPython: neither may look for a screen or for git.
+os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+
+import pytest
+import torch
+from hypothesis import settings
+from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
+from tensordict import TensorDict
+
+from fgtutor.feasibility import FeasibilityNet
+from fgtutor.patches import PatchGrid
+from fgtutor.robots.toy import ToyEnv
+from fgtutor.specialist import Specialist
+from fgtutor.terrain import World, make_terrain
+
+# Two cores are shared with whatever else runs; small networks are fastest on one thread anyway.
+torch.set_num_threads(1)
+settings.register_profile("house", deadline=None, max_examples=25)
+settings.load_profile("house")
+
+
+@pytest.fixture
+def make_specialist() -> Callable[..., Specialist]:
+    """Return a maker of real, untrained specialists: `make_specialist(name, seed=0, **fields)`."""
+
+    def make(
+        name: str = "steps", *, seed: int = 0, normalise: bool = False, **fields
+    ) -> Specialist:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            grid = fields.pop("grid", PatchGrid(ahead=0.3, behind=0.2, half_width=0.2))
+            policy = MLPModel(
+                TensorDict({"policy": torch.zeros(1, 6)}, batch_size=[1]),
+                {"actor": ["policy"]},
+                "actor",
+                3,
+                hidden_dims=[8, 4],
+                activation="elu",
+                obs_normalization=normalise,
+                distribution_cfg={
+                    "class_name": GaussianDistribution,
+                    "init_std": 0.5,
+                    "std_type": "log",
+                },
+            )
+            net = FeasibilityNet(grid.num_points, hidden=(16, 8), latent=4)
+        values = {
+            "name": name,
+            "robot": "toy",
+            "policy": policy,
+            "feasibility": net,
+            "grid": grid,
+            "command": (0.6, 0.0, 0.0),
+            "label_seconds": 1.0,
+            "quantiles": {"0.5": 0.05, "0.9": 0.1, "0.95": 0.2, "0.99": 0.4},
+            "provenance": {"terrain": name, "samples": 1000, "seed": seed},
+        }
+        return Specialist(**(values | fields))
+
+    return make
+
+
+@pytest.fixture
+def make_rolling(make_specialist) -> Callable[..., Specialist]:
+    """Return a maker of toys that only roll: a policy of zero weights leaves the legs alone.
+
+    Its Feasibility-Net is untrained; `f` sets what it answers everywhere (its last bias).
+    """
+
+    def make(name: str = "steps", *, f: float = 0.8, **fields) -> Specialist:
+        probe = ToyEnv(World([[make_terrain("flat", robot="toy")]]), 1)
+        observations = probe.get_observations()
+        policy = MLPModel(
+            observations,
+            {"actor": ["policy"]},
+            "actor",
+            probe.num_actions,
+            hidden_dims=[4],
+            activation="elu",
+            distribution_cfg={"class_name": GaussianDistribution, "std_type": "log"},
+        )
+        net = FeasibilityNet(probe.grid.num_points, hidden=(8, 8), latent=2)
+        with torch.no_grad():
+            for parameter in (*policy.parameters(), *net.parameters()):
+                parameter.zero_()
+            net.head[-1].bias.fill_(math.log(f / (1 - f)))
+        values = {
+            "grid": probe.grid,
+            "policy": policy,
+            "feasibility": net,
+            "command": (0.85, 0.0, 0.0),
+            "quantiles": {"0.5": 1.0, "0.9": 90.0, "0.95": 95.0, "0.99": 99.0},
+        }
+        return make_specialist(name, **(values | fields))
+
+    return make

@@ -1,0 +1,133 @@
+"""The doctor's findings on this machine, and on broken ones made for it."""
+
+import importlib
+import importlib.metadata
+import os
+import subprocess
+import sys
+
+import pytest
+
+from fgtutor import doctor
+from fgtutor.doctor import DoctorConfig, Finding
+from fgtutor.specialist import save_specialist
+
+
+def findings(zoo, **settings) -> dict[str, Finding]:
+    config = DoctorConfig(zoo=zoo, gl=False, **settings)
+    return {finding.what: finding for finding in doctor.examine(config)}
+
+
+@pytest.fixture
+def zoo(make_specialist, tmp_path):
+    save_specialist(make_specialist(), tmp_path / "zoo" / "toy" / "steps")
+    return tmp_path / "zoo"
+
+
+def test_a_sound_installation_has_nothing_broken(zoo, capsys):
+    assert doctor.run(DoctorConfig(zoo=zoo, gl=False)) == 0
+    output = capsys.readouterr().out
+    assert "BROKEN" not in output
+    for what in ("python", "torch", "pymunk", "gpu", "cores", "memory", "disk", "zoo toy/steps"):
+        assert what in output
+
+
+def test_versions_are_those_installed(zoo):
+    found = findings(zoo)
+    for name in doctor.ESSENTIAL:
+        assert found[name].value == importlib.metadata.version(name)
+
+
+def test_a_corrupt_specialist_is_broken_and_named(zoo, capsys):
+    file = zoo / "toy" / "steps" / "policy.safetensors"
+    file.write_bytes(file.read_bytes()[:-1])
+    finding = findings(zoo)["zoo toy/steps"]
+    assert finding.state == "broken" and str(file) in finding.fix
+    assert doctor.run(DoctorConfig(zoo=zoo, gl=False)) == 1
+    assert "BROKEN  zoo toy/steps" in capsys.readouterr().out
+
+
+def test_a_half_written_folder_is_passed_over(zoo):
+    (zoo / "toy" / "steps").rename(zoo / "toy" / ".steps.0000.old")
+    assert findings(zoo)["zoo"].state == "broken"
+
+
+@pytest.mark.parametrize("folder", ["empty", "absent"])
+def test_an_empty_zoo_is_broken(tmp_path, folder):
+    (tmp_path / "empty").mkdir()
+    finding = findings(tmp_path / folder)["zoo"]
+    assert finding.state == "broken" and str(tmp_path / folder) in finding.value
+
+
+@pytest.mark.parametrize(("name", "state"), [("pymunk", "broken"), ("jupyterlab", "note")])
+def test_a_missing_package_is_reported(zoo, monkeypatch, name, state):
+    installed = importlib.metadata.version
+
+    def version(package):
+        if package == name:
+            raise importlib.metadata.PackageNotFoundError(package)
+        return installed(package)
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    finding = findings(zoo)[name]
+    assert finding.state == state and "pip install" in finding.fix
+
+
+def test_a_torch_that_does_not_load_still_gets_a_report(zoo, monkeypatch):
+    real = importlib.import_module
+
+    def broken(name):
+        if name in ("torch", "fgtutor.specialist"):
+            raise OSError("loading\nlibtorch_cpu.so: wrong ELF class")
+        return real(name)
+
+    monkeypatch.setattr(importlib, "import_module", broken)
+    found = findings(zoo)
+    assert found["import torch"].state == found["zoo"].state == "broken"
+    assert found["import torch"].value == "libtorch_cpu.so: wrong ELF class"
+    assert "disk" in found
+
+
+@pytest.mark.parametrize(("limit", "what"), [("LOW_DISK", "disk"), ("LOW_MEMORY", "memory")])
+def test_a_small_machine_gets_a_note(zoo, monkeypatch, limit, what):
+    monkeypatch.setattr(doctor, limit, 1e9)
+    assert findings(zoo)[what].state == "note" and findings(zoo)[what].fix
+
+
+def test_a_gl_backend_that_does_not_exist_is_named_with_a_reason(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "crayons")
+    [finding] = [f for f in doctor.examine(DoctorConfig(gl_seconds=60)) if f.what == "gl"]
+    assert finding.state == "note" and "crayons" in finding.value and "MUJOCO_GL" in finding.fix
+
+
+def test_the_gl_probe_agrees_with_drawing_here(monkeypatch):
+    # Whatever this machine can do, the probe says of each backend what a drawing process says.
+    for backend in doctor.GL_BACKENDS.get(sys.platform, ()):
+        drawn = subprocess.run(
+            [sys.executable, "-c", doctor._RENDER],
+            env=os.environ | {"MUJOCO_GL": backend},
+            capture_output=True,
+            check=False,
+        )
+        reason = doctor.probe_gl(backend, 60.0)
+        assert (reason is None) == (drawn.returncode == 0)
+        assert reason is None or reason
+
+
+def test_a_gl_backend_that_hangs_is_given_up():
+    assert doctor.probe_gl("egl", 1e-3) == "no picture within 0.001 s"
+
+
+def test_the_table_lines_up_and_lists_what_to_do():
+    rows = [
+        Finding(what="a", value="1"),
+        Finding(what="long name", value="2", state="note", fix="mend it"),
+    ]
+    assert doctor.report(rows).splitlines() == [
+        "ok      a          1",
+        "note    long name  2",
+        "",
+        "What to do:",
+        "- long name: mend it",
+    ]
+    assert doctor.report(rows[:1]).endswith("Nothing to do.")
