@@ -1,0 +1,34 @@
+"""The d = 8 headings: their order, yaw angles and cell steps (paper, Sec. III-B).
+
+Heading k points k * 45 degrees counter-clockwise from +x, so 0 = +x, 2 = +y, 4 = -x, 6 = -y. This
+is the only file that knows the order; everything else asks it.
+"""
+
+import math
+
+import numpy as np
+
+NUM_HEADINGS = 8
+"""d, the number of headings (paper, Sec. III-B)."""
+
+YAWS = np.arange(NUM_HEADINGS) * (math.pi / 4)
+"""Yaw of each heading, radians counter-clockwise from +x (REP-103)."""
+
+STEPS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)])
+"""Cell step (dix, diy) of each heading."""
+
+STEP_LENGTHS = np.hypot(STEPS[:, 0], STEPS[:, 1])
+"""Length of each step in cells: 1 along an axis, sqrt(2) along a diagonal."""
+
+NAMES = ("+x", "+x+y", "+y", "-x+y", "-x", "-x-y", "-y", "+x-y")
+"""How figures and messages name the headings."""
+
+
+def opposite(heading: int) -> int:
+    """Return the heading that points the other way."""
+    return (heading + NUM_HEADINGS // 2) % NUM_HEADINGS
+
+
+def nearest_heading(yaw: float) -> int:
+    """Return the heading closest to `yaw` (radians, any number of turns)."""
+    return round(yaw / (math.pi / 4)) % NUM_HEADINGS

@@ -1,0 +1,149 @@
+"""Local height patches H_xy around a pose, cut from an elevation map (paper, Sec. III-B).
+
+Reads a prepared map (no unknown cells, deep holes levelled) and poses (x, y, yaw); gives heights
+relative to the ground under the robot. Training and planning call the same function, which is what
+makes the planner's input look like the training data.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchGrid:
+    """Where a patch is sampled, in the robot's yaw frame (x ahead, y left), metres."""
+
+    ahead: float = 0.8
+    """Reach in front of the robot's centre, m."""
+    behind: float = 0.8
+    """Reach behind the robot's centre, m."""
+    half_width: float = 0.5
+    """Reach to either side, m."""
+    spacing: float = 0.1
+    """Distance between neighbouring points, m."""
+    footprint: tuple[float, float] = (0.2, 0.1)
+    """Half length and half width of the area whose median height is the ground under the robot, m."""
+
+    def __post_init__(self) -> None:
+        if not (self.spacing > 0 and self.ahead >= 0 and self.behind >= 0 and self.half_width >= 0):
+            raise ConfigError(f"PatchGrid needs spacing > 0 and reaches >= 0, got {self}")
+        if not self.footprint_index.numel():
+            raise ConfigError(
+                f"no patch point lies under the footprint {self.footprint}: enlarge it"
+            )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Points along x and along y."""
+        rows = round(self.ahead / self.spacing) + round(self.behind / self.spacing) + 1
+        return rows, 2 * round(self.half_width / self.spacing) + 1
+
+    @property
+    def num_points(self) -> int:
+        """Points in one flattened patch."""
+        return self.shape[0] * self.shape[1]
+
+    @cached_property
+    def points(self) -> Float[Tensor, "points 2"]:
+        """The points (x, y) in the yaw frame, m; x varies slowest, from behind to ahead."""
+        rows, columns = self.shape
+        x = (torch.arange(rows) - round(self.behind / self.spacing)) * self.spacing
+        y = (torch.arange(columns) - columns // 2) * self.spacing
+        return torch.cartesian_prod(x, y).to(torch.float32).reshape(-1, 2)
+
+    @cached_property
+    def footprint_index(self) -> Tensor:
+        """Indices of the points that lie under the robot."""
+        half_length, half_width = self.footprint
+        inside = (self.points[:, 0].abs() <= half_length + 1e-6) & (
+            self.points[:, 1].abs() <= half_width + 1e-6
+        )
+        return inside.nonzero().flatten()
+
+
+HOLE_DEPTH = 0.5
+"""Depth at which a hole counts as bottomless, m: deeper cells look alike to a patch."""
+HOLE_REACH = 0.8
+"""How far the ground that a hole is measured against may be, m."""
+
+
+def prepare(elevation: ElevationMap) -> ElevationMap:
+    """Return the map that patches are taken from: unknown cells filled, deep holes levelled.
+
+    A chasm's depth would dominate L_recon while saying nothing about how hard it is to cross; cells
+    more than `HOLE_DEPTH` below the highest ground within `HOLE_REACH` are raised to that depth.
+    """
+    return elevation.filled().levelled(depth=HOLE_DEPTH, reach=HOLE_REACH)
+
+
+def sample_heights(
+    heights: Float[Tensor, "nx ny"],
+    xy: Float[Tensor, "*batch 2"],
+    *,
+    resolution: float,
+    origin: tuple[float, float],
+) -> Float[Tensor, "*batch"]:
+    """Interpolate heights bilinearly at world points; beyond the border the edge cell continues."""
+    nx, ny = heights.shape
+    u = ((xy[..., 0] - origin[0]) / resolution - 0.5).clamp(0, nx - 1)
+    v = ((xy[..., 1] - origin[1]) / resolution - 0.5).clamp(0, ny - 1)
+    i = u.long().clamp(max=max(nx - 2, 0))
+    j = v.long().clamp(max=max(ny - 2, 0))
+    a, b = u - i, v - j
+    flat, base = heights.reshape(-1), i * ny + j
+    right, up = ny * (nx > 1), int(ny > 1)
+    near = flat[base] * (1 - b) + flat[base + up] * b
+    far = flat[base + right] * (1 - b) + flat[base + right + up] * b
+    return near * (1 - a) + far * a
+
+
+def rotate(points: Float[Tensor, "points 2"], yaw: Float[Tensor, "*batch"]) -> Tensor:
+    """Rotate yaw-frame points into the world, one copy per yaw: [*batch, points, 2]."""
+    cos, sin = torch.cos(yaw)[..., None], torch.sin(yaw)[..., None]
+    x, y = points[:, 0], points[:, 1]
+    return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=-1)
+
+
+def ground_height(patch: Float[Tensor, "*batch points"], grid: PatchGrid) -> Tensor:
+    """Return the median height of the points under the footprint, [*batch, 1].
+
+    The lower of the two middle values is taken when their number is even.
+    """
+    return patch[..., grid.footprint_index].median(dim=-1, keepdim=True).values
+
+
+def sample_patches(
+    heights: Float[Tensor, "nx ny"],
+    poses: Float[Tensor, "*batch 3"],
+    grid: PatchGrid,
+    *,
+    resolution: float,
+    origin: tuple[float, float] = (0.0, 0.0),
+) -> Float[Tensor, "*batch points"]:
+    """Cut the yaw-aligned patch H_xy at each pose (x, y, yaw), relative to the ground beneath it.
+
+    `heights` comes from a prepared map (see `prepare`). The rotation to the heading happens here, so
+    a patch always looks along the way the robot faces. Raises `ConfigError` if a pose or a height
+    near it is not finite, since a NaN would spread through the whole batch.
+    """
+    offsets = rotate(grid.points.to(heights), poses[..., 2])
+    points = poses[..., None, :2] + offsets
+    patch = sample_heights(heights, points, resolution=resolution, origin=origin)
+    if not torch.isfinite(patch).all():
+        raise ConfigError(
+            "sample_patches needs finite heights and poses; call patches.prepare(map) first"
+        )
+    return patch - ground_height(patch, grid)
+
+
+def reach(grid: PatchGrid) -> float:
+    """Return the distance from the centre to the farthest point of the patch, m."""
+    return math.hypot(max(grid.ahead, grid.behind), grid.half_width)
