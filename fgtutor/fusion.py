@@ -1,0 +1,49 @@
+"""Fuse the feasibility tensors of all specialists: the best feasibility and whose it is.
+
+Reads F_i [nx, ny, 8], one a specialist; gives F_max and the policy map P, both [nx, ny, 8].
+Source: paper, Sec. III-C (Eqs. 6-7).
+"""
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from fgtutor.errors import PlanningError
+
+Array = TypeVar("Array", Tensor, np.ndarray)
+
+
+def fuse(
+    tensors: Sequence[Float[Array, "nx ny 8"]],
+) -> tuple[Float[Array, "nx ny 8"], Int[Array, "nx ny 8"]]:
+    """Return F_max = max_i F_i and P = argmax_i F_i; on a tie the first specialist is taken.
+
+    The answer is of the kind of the first tensor, torch or numpy; P is int64. Raises
+    `PlanningError` if there is no tensor, if shapes differ, or if a value is not finite.
+    """
+    if len(tensors) == 0:
+        raise PlanningError(
+            "fuse needs at least one feasibility tensor, got none: add a specialist"
+        )
+    arrays = [np.asarray(tensor) for tensor in tensors]
+    for index, array in enumerate(arrays):
+        if array.shape != arrays[0].shape:
+            raise PlanningError(
+                f"tensor {index} has shape {array.shape}, the first has {arrays[0].shape}: "
+                "tensorize every specialist on the same map"
+            )
+        if not np.isfinite(array).all():
+            raise PlanningError(
+                f"tensor {index} holds NaN or infinity: check that specialist's Feasibility-Net"
+            )
+    stacked = np.stack(arrays)
+    policy_map = stacked.argmax(axis=0)
+    fused = np.take_along_axis(stacked, policy_map[None], axis=0)[0]
+    policy_map = policy_map.astype(np.int64, copy=False)
+    if isinstance(tensors[0], Tensor):
+        return torch.from_numpy(fused), torch.from_numpy(policy_map)
+    return fused, policy_map

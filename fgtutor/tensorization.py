@@ -1,0 +1,215 @@
+"""From elevation map to feasibility tensor: a window slides over the map, once per heading.
+
+Reads an `ElevationMap` M and a specialist (its Feasibility-Net, patch grid and planning command);
+gives f, L_recon and F_i = w_ood * f, all [nx, ny, 8].
+Source: paper, Sec. III-B (Eqs. 4-5).
+
+Two ways lead to the same numbers. The *reference* cuts every patch with `sample_patches`, as
+training does. The *fast* way turns the loop inside out: seen from all cells at once, one point of
+the patch is the whole map, shifted. So the network's first layer, a weighted sum of patch points,
+is a weighted sum of shifted maps: a convolution of M. It is evaluated as one matrix product a strip
+of the map, with a shifted strip as each row, so that memory stays flat. A convolution routine was
+no faster along the axes and slower along the diagonals, where the turned kernel has two to eight
+times more taps (at 0.1 and 0.05 m a cell) than the patch has points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from fgtutor import directions, patches
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError, ThresholdError
+from fgtutor.feasibility import TAU_HIGH, TAU_LOW, calibrated_taus, ood_weight
+
+if TYPE_CHECKING:
+    from fgtutor.specialist import Specialist
+
+Taus = Literal["paper", "calibrated"] | tuple[float, float]
+Method = Literal["auto", "reference", "fast"]
+
+STRIP_CELLS = 2048
+"""Cells assessed at a time: 187 points of each are 1.5 MB. The speed hardly depends on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """What one specialist says about every cell and heading of a map, before any threshold."""
+
+    f: Float[Tensor, "nx ny 8"]
+    """Feasibility f, the predicted r_v in [0, 1]."""
+    reconstruction: Float[Tensor, "nx ny 8"]
+    """L_recon, m^2 summed over the patch."""
+
+    def ood(self, tau_low: float = TAU_LOW, tau_high: float = TAU_HIGH) -> Tensor:
+        """Return w_ood (Eq. 4), [nx, ny, 8]."""
+        return ood_weight(self.reconstruction, tau_low, tau_high)
+
+    def weighted(self, tau_low: float = TAU_LOW, tau_high: float = TAU_HIGH) -> Tensor:
+        """Return F_i = w_ood * f (Eq. 5), [nx, ny, 8]."""
+        return self.ood(tau_low, tau_high) * self.f
+
+
+def tensorize(
+    elevation: ElevationMap,
+    specialist: Specialist,
+    *,
+    taus: Taus = "paper",
+    method: Method = "auto",
+    unknown: Literal["block", "fill"] = "block",
+) -> Float[Tensor, "nx ny 8"]:
+    """Return F_i(x, y, k) = w_ood * f: how well this specialist leaves a cell along heading k.
+
+    `taus` is "paper", "calibrated" (from the specialist's own terrain) or a pair (low, high). With
+    `unknown="block"` F is zero wherever a step would start from or end on an unknown cell, or leave
+    the map; "fill" trusts the filled heights instead. Raises `ThresholdError` or `ConfigError` for
+    settings that cannot work.
+    """
+    if unknown not in ("block", "fill"):
+        raise ConfigError(f'unknown must be "block" or "fill", got {unknown!r}')
+    low, high = resolve_taus(taus, specialist)
+    tensor = assess(elevation, specialist, method=method).weighted(low, high)
+    if unknown == "block":
+        tensor[~torch.from_numpy(steps_on_known(elevation.known))] = 0
+    return tensor
+
+
+@torch.no_grad()
+def assess(elevation: ElevationMap, specialist: Specialist, method: Method = "auto") -> Assessment:
+    """Return f and L_recon of every cell and heading; unknown cells are read as filled.
+
+    Give the map as it was loaded: it is prepared for patches here. "auto" is the fast way, which
+    won on every map measured. Raises `ConfigError` for another method.
+    """
+    if method not in _WAYS:
+        raise ConfigError(f"method must be one of {', '.join(_WAYS)}, got {method!r}")
+    net, grid = specialist.feasibility, specialist.grid
+    heights = patches.prepare(elevation).heights
+    command = torch.tensor(specialist.command, dtype=torch.float32)
+    nx, ny = heights.shape
+    f = torch.empty(nx, ny, directions.NUM_HEADINGS)
+    reconstruction = torch.empty_like(f)
+    for heading, yaw in enumerate(directions.YAWS):
+        for rows, patch in _WAYS[method](heights, yaw, grid, elevation.resolution):
+            feasibility = net.feasibility(patch, command.expand(len(patch), -1))
+            f[rows, :, heading] = feasibility.reshape(-1, ny)
+            reconstruction[rows, :, heading] = net.reconstruction(patch).reshape(-1, ny)
+    return Assessment(f, reconstruction)
+
+
+def resolve_taus(taus: Taus, specialist: Specialist) -> tuple[float, float]:
+    """Return (tau_low, tau_high) for a choice by name, or the given pair."""
+    if taus == "paper":
+        return TAU_LOW, TAU_HIGH
+    if taus == "calibrated":
+        return calibrated_taus(specialist.quantiles)
+    if isinstance(taus, str) or len(taus) != 2:
+        raise ThresholdError(f'taus must be "paper", "calibrated" or (low, high), got {taus!r}')
+    return taus
+
+
+def why_blocked(
+    x: float,
+    y: float,
+    *,
+    elevation: ElevationMap,
+    assessments: Mapping[str, Assessment],
+    taus: Mapping[str, tuple[float, float]] | None = None,
+    f_min: float = 0.1,
+) -> str:
+    """Say which layer closes the cell at (x, y), m: the map, unknown cells, f or w_ood.
+
+    `assessments` holds each policy's `assess` of the map and `taus` each one's thresholds (default:
+    the paper's). A cell is closed when no policy can leave it with F >= f_min.
+    """
+    if not elevation.contains(x, y):
+        return f"({x:g}, {y:g}) m is off the map."
+    cell = elevation.cell_of(x, y)
+    where = f"Cell {cell} at ({x:g}, {y:g}) m"
+    if not elevation.known[cell]:
+        return f"{where} is closed: it was never observed."
+    open_headings = np.flatnonzero(steps_on_known(elevation.known)[cell])
+    if not len(open_headings):
+        return f"{where} is closed: all its neighbours are unknown or off the map."
+    reasons = []
+    for name, assessment in assessments.items():
+        f = assessment.f[cell][open_headings]
+        w_ood = assessment.ood(*(taus or {}).get(name, (TAU_LOW, TAU_HIGH)))[cell][open_headings]
+        best = int((w_ood * f).argmax())
+        towards = directions.NAMES[open_headings[best]]
+        if w_ood[best] * f[best] >= f_min:
+            return (
+                f"{where} is open: {name} leaves it towards {towards} with "
+                f"F = {w_ood[best] * f[best]:.2f}."
+            )
+        if f.max() < f_min:
+            reasons.append(f"{name} would not keep its velocity (f <= {f.max():.2f})")
+        else:
+            reasons.append(
+                f"{name} does not know such terrain (f reaches {f.max():.2f}, "
+                f"but w_ood only {w_ood.max():.2f})"
+            )
+    return f"{where} is closed at f_min = {f_min:g}: {'; '.join(reasons)}."
+
+
+def steps_on_known(known: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "nx ny 8"]:
+    """Say for which headings both a cell and its neighbour are known and on the map."""
+    nx, ny = known.shape
+    around = np.pad(known, 1, constant_values=False)
+    ends = [around[1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny] for dx, dy in directions.STEPS]
+    return np.stack(ends, axis=-1) & known[..., None]
+
+
+def _strips(shape: tuple[int, int]) -> Iterator[slice]:
+    """Cut the map's rows into strips of about `STRIP_CELLS` cells."""
+    rows = max(1, STRIP_CELLS // shape[1])
+    for start in range(0, shape[0], rows):
+        yield slice(start, min(start + rows, shape[0]))
+
+
+def _sampled(
+    heights: Float[np.ndarray, "nx ny"], yaw: float, grid: patches.PatchGrid, resolution: float
+) -> Iterator[tuple[slice, Float[Tensor, "cells points"]]]:
+    """Reference: cut the patch of every cell by itself."""
+    # Positions in float64: in float32, metres ten from the origin round off 1e-5 of a cell.
+    surface = torch.tensor(heights, dtype=torch.float64)
+    y = (torch.arange(heights.shape[1], dtype=torch.float64) + 0.5) * resolution
+    for rows in _strips(heights.shape):
+        x = (torch.arange(rows.start, rows.stop, dtype=torch.float64) + 0.5) * resolution
+        poses = torch.cartesian_prod(x, y, torch.tensor([yaw], dtype=torch.float64))
+        patch = patches.sample_patches(surface, poses, grid, resolution=resolution)
+        yield rows, patch.float()
+
+
+def _shifted(
+    heights: Float[np.ndarray, "nx ny"], yaw: float, grid: patches.PatchGrid, resolution: float
+) -> Iterator[tuple[slice, Float[Tensor, "cells points"]]]:
+    """Fast: one point of the patch, for all cells, is the map shifted by that point's offset."""
+    ny = heights.shape[1]
+    offsets = patches.rotate(grid.points.double(), torch.tensor(yaw)) / resolution
+    whole = offsets.floor().long()
+    a, b = (offsets - whole).float().T[..., None, None]
+    margin = int(whole.abs().max()) + 1
+    i, j = (whole + margin).T
+    surface = torch.from_numpy(np.pad(heights, margin, mode="edge"))
+    for rows in _strips(heights.shape):
+        strip = surface[rows.start : rows.stop + 2 * margin]
+        # Only height differences matter; small numbers keep float32 sharp on high ground.
+        strip = strip - strip.mean()
+        # A view, not a copy: shifted[i, j] is the strip moved by (i - margin, j - margin) cells.
+        shifted = strip.unfold(0, rows.stop - rows.start, 1).unfold(1, ny, 1)
+        # The bilinear rule of `sample_heights`: a shift by part of a cell blends its neighbours.
+        near = torch.lerp(shifted[i, j], shifted[i, j + 1], b)
+        far = torch.lerp(shifted[i + 1, j], shifted[i + 1, j + 1], b)
+        patch = torch.lerp(near, far, a).flatten(1).T
+        yield rows, patch - patches.ground_height(patch, grid)
+
+
+_WAYS = {"auto": _shifted, "reference": _sampled, "fast": _shifted}

@@ -1,0 +1,465 @@
+"""Planning: costs against networkx, routes known by hand, errors that say what to change."""
+
+import json
+
+import networkx
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fgtutor import directions
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import (
+    ConfigError,
+    InfeasibleCellError,
+    OffMapError,
+    PlanningError,
+    UnknownCellError,
+    UnreachableError,
+)
+from fgtutor.fusion import fuse
+from fgtutor.planning import Planner, Route, as_networkx, as_switching_networkx, plan
+
+BACKENDS = ("networkx", "scipy")
+RESOLUTION = 0.2
+
+
+def flat(nx: int, ny: int, known: np.ndarray | None = None) -> ElevationMap:
+    return ElevationMap(np.zeros((nx, ny)), resolution=RESOLUTION, origin=(-1.0, 3.0), known=known)
+
+
+def random_problem(seed: int, policies: int = 3):
+    """Return tensors without any symmetry, with closed edges and unknown cells, and two points."""
+    rng = np.random.default_rng(seed)
+    nx, ny = rng.integers(3, 11, 2)
+    tensors = list(rng.random((policies, nx, ny, 8)) * (rng.random((policies, nx, ny, 8)) < 0.6))
+    known = rng.random((nx, ny)) < 0.9
+    ends = np.argwhere(np.ones((nx, ny)))[rng.choice(nx * ny, 2, replace=False)]
+    known[tuple(ends.T)] = True
+    grid = flat(nx, ny, known)
+    start, goal = (grid.centre_of(*cell) for cell in ends.tolist())
+    return tensors, grid, start, goal
+
+
+def step_cost(value: float, heading: int, cost: str) -> float:
+    return 1 / value * (directions.STEP_LENGTHS[heading] * RESOLUTION if cost == "length" else 1)
+
+
+def oracle(tensor, grid: ElevationMap, start, goal, *, f_min: float, cost: str) -> float | None:
+    """Return the cheapest cost, by the definition and edge by edge."""
+    graph = networkx.DiGraph()
+    for ix, iy, heading in np.ndindex(tensor.shape):
+        x, y = (np.array((ix, iy)) + directions.STEPS[heading]).tolist()
+        inside = 0 <= x < grid.shape[0] and 0 <= y < grid.shape[1]
+        if tensor[ix, iy, heading] < f_min or not inside:
+            continue
+        if grid.known[ix, iy] and grid.known[x, y]:
+            weight = step_cost(tensor[ix, iy, heading], heading, cost)
+            graph.add_edge((ix, iy), (x, y), weight=weight)
+    try:
+        ends = grid.cell_of(*start), grid.cell_of(*goal)
+        return networkx.shortest_path_length(graph, *ends, weight="weight")
+    except (networkx.NetworkXNoPath, networkx.NodeNotFound):
+        return None
+
+
+def check_route(route: Route, fused, policy_map, grid: ElevationMap, start, goal, cost: str):
+    """Walk the route again: it joins start and goal, and its numbers are those of its edges."""
+    assert tuple(route.cells[0]) == grid.cell_of(*start)
+    assert tuple(route.cells[-1]) == grid.cell_of(*goal)
+    total = 0.0
+    for i, heading in enumerate(route.headings):
+        assert (route.cells[i] + directions.STEPS[heading] == route.cells[i + 1]).all()
+        edge = (*route.cells[i], heading)
+        assert route.feasibility[i] == fused[edge] and route.policies[i] == policy_map[edge]
+        total += step_cost(fused[edge], heading, cost)
+    assert route.cost == pytest.approx(total, abs=1e-9)
+    assert grid.known[tuple(route.cells.T)].all()
+    assert route.length == pytest.approx(np.linalg.norm(np.diff(route.xy, axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize("cost", ["inverse", "length"])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_two_hundred_random_maps_cost_what_networkx_says(backend, cost):
+    found = 0
+    for seed in range(200):
+        tensors, grid, start, goal = random_problem(seed)
+        fused, policy_map = fuse(tensors)
+        settings = {"grid": grid, "start": start, "goal": goal, "cost": cost, "f_min": 0.3}
+        expected = oracle(fused, grid, start, goal, cost=cost, f_min=0.3)
+        if expected is None:
+            with pytest.raises((InfeasibleCellError, UnreachableError)):
+                plan(fused, policy_map, backend=backend, **settings)
+            continue
+        route = plan(fused, policy_map, backend=backend, **settings)
+        assert route.cost == pytest.approx(expected, abs=1e-9)
+        check_route(route, fused, policy_map, grid, start, goal, cost)
+        found += 1
+    assert found > 150
+
+
+@given(st.integers(0, 10**6), st.integers(1, 3))
+def test_turning_the_map_keeps_the_cost(seed, quarter_turns):
+    tensors, grid, start, goal = random_problem(seed)
+    fused, policy_map = fuse(tensors)
+    turned = [
+        np.roll(np.rot90(array, quarter_turns), 2 * quarter_turns, axis=2)
+        for array in (fused, policy_map)
+    ]
+
+    def turn(point):
+        z = complex(*point) * 1j**quarter_turns
+        return z.real, z.imag
+
+    costs = []
+    for (f, p), g, ends in (
+        ((fused, policy_map), grid, (start, goal)),
+        (turned, grid.rotated90(quarter_turns), (turn(start), turn(goal))),
+    ):
+        try:
+            costs.append(plan(f, p, grid=g, start=ends[0], goal=ends[1], backend="scipy").cost)
+        except PlanningError:
+            costs.append(None)
+    assert costs[0] == pytest.approx(costs[1], abs=1e-9)
+
+
+def two_specialists():
+    """Return a corridor of 7 x 3 cells: `walker` stops at a wall in column 3, `climber` does not.
+
+    The walker tracks perfectly (1.0) but cannot enter the wall; the climber manages 0.5 anywhere.
+    """
+    walker, climber = np.ones((7, 3, 8)), np.full((7, 3, 8), 0.5)
+    for ix, iy, heading in np.ndindex(walker.shape):
+        if ix == 3 or ix + directions.STEPS[heading][0] == 3:
+            walker[ix, iy, heading] = 0.0
+    return walker, climber
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_right_specialist_crosses_the_wall(backend):
+    grid = flat(7, 3)
+    walker, climber = two_specialists()
+    fused, policy_map = fuse([walker, climber])
+    route = plan(
+        fused,
+        policy_map,
+        grid=grid,
+        start=grid.centre_of(0, 1),
+        goal=grid.centre_of(6, 1),
+        backend=backend,
+        tensors=[walker, climber],
+        names=["walker", "climber"],
+    )
+    # Two steps up to the wall, two over it at 1 / 0.5, two after it.
+    assert route.cost == pytest.approx(2 + 2 * 2 + 2)
+    assert route.policies.tolist() == [0, 0, 1, 1, 0, 0]
+    assert route.switches == 2
+    assert "walker -> climber -> walker" in repr(route)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("slow", "rows"),
+    # Through the middle: 2 + 2 / slow. Round it: down to row 0 at 1, two steps at 1 / 0.8, and 1.
+    [(0.9, {1}), (0.2, {0, 1})],
+)
+def test_a_detour_is_taken_when_it_pays(backend, slow, rows):
+    grid = flat(5, 3)
+    tensor = np.ones((5, 3, 8))
+    tensor[:, 2] = 0.0  # row 2 is closed, so that the detour is row 0
+    tensor[:, 0] = 0.8
+    tensor[2, 1] = slow
+    tensor[1, 1, 0] = slow
+    tensor[1, :, [1, 7]] = 0.0  # nobody cuts diagonally into column 2
+    ends = {"start": grid.centre_of(0, 1), "goal": grid.centre_of(4, 1)}
+    route = plan(tensor, np.zeros(tensor.shape), grid=grid, backend=backend, **ends)
+    assert set(route.cells[:, 1]) == rows
+    assert route.cost == pytest.approx(min(2 + 2 / slow, 4.5))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_up_a_step_and_down_a_step_are_two_different_edges(backend):
+    grid = flat(4, 2)
+    tensor = np.ones((4, 2, 8))
+    tensor[1, :, [0, 1, 7]] = 0.0  # the ledge between columns 1 and 2 is too high to climb
+    left, right = grid.centre_of(0, 0), grid.centre_of(3, 0)
+    policy_map = np.zeros(tensor.shape)
+    assert plan(tensor, policy_map, grid=grid, start=right, goal=left, backend=backend).cost == 3
+    with pytest.raises(UnreachableError):
+        plan(tensor, policy_map, grid=grid, start=left, goal=right, backend=backend)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_cost_by_length_prefers_the_shorter_way(backend):
+    grid = flat(3, 3)
+    tensor = np.full((3, 3, 8), 0.5)
+    ends = {"start": grid.centre_of(0, 0), "goal": grid.centre_of(2, 1)}
+    route = plan(tensor, np.zeros(tensor.shape), grid=grid, cost="length", backend=backend, **ends)
+    # One step along x and one diagonal, 0.2 m cells, twice the length at F = 0.5.
+    assert route.cost == pytest.approx(2 * 0.2 * (1 + 2**0.5))
+    assert route.length == pytest.approx(0.2 * (1 + 2**0.5))
+
+
+def switching_oracle(tensors, grid, start, goal, *, f_min, switch_cost) -> float | None:
+    """Return the cheapest cost by Bellman-Ford over (cell, policy), from the definition."""
+    best = np.full((len(tensors), *grid.shape), np.inf)
+    best[(slice(None), *grid.cell_of(*start))] = 0
+    for _ in range(best.size):
+        before = best.copy()
+        for new, ix, iy, heading in np.ndindex(len(tensors), *grid.shape, 8):
+            x, y = (np.array((ix, iy)) + directions.STEPS[heading]).tolist()
+            value = tensors[new][ix, iy, heading]
+            inside = 0 <= x < grid.shape[0] and 0 <= y < grid.shape[1]
+            if value < f_min or not inside or not (grid.known[ix, iy] and grid.known[x, y]):
+                continue
+            for old in range(len(tensors)):
+                if tensors[old][ix, iy, heading] >= f_min:
+                    offer = best[old, ix, iy] + 1 / value + switch_cost * (old != new)
+                    best[new, x, y] = min(best[new, x, y], offer)
+        if np.array_equal(before, best):
+            break
+    cost = best[(slice(None), *grid.cell_of(*goal))].min()
+    return cost if np.isfinite(cost) else None
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_switching_costs_what_bellman_ford_says(seed):
+    tensors, grid, start, goal = random_problem(seed + 1000, policies=2)
+    fused, policy_map = fuse(tensors)
+    settings = {"f_min": 0.3, "switch_cost": 1.5}
+    expected = switching_oracle(tensors, grid, start, goal, **settings)
+    for backend in BACKENDS:
+        common = {"grid": grid, "start": start, "goal": goal, "tensors": tensors, **settings}
+        if expected is None:
+            with pytest.raises((InfeasibleCellError, UnreachableError)):
+                plan(fused, policy_map, backend=backend, **common)
+            continue
+        route = plan(fused, policy_map, backend=backend, **common)
+        assert route.cost == pytest.approx(expected, abs=1e-9)
+        steps = zip(route.cells, route.headings, route.policies, strict=False)
+        driven = sum(1 / tensors[p][(*cell, k)] for cell, k, p in steps)
+        assert route.cost == pytest.approx(driven + 1.5 * route.switches)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_switch_must_be_worth_its_cost(backend):
+    grid = flat(7, 2)
+    even, odd = np.full((7, 2, 8), 0.8), np.full((7, 2, 8), 0.8)
+    even[::2], odd[1::2] = 1.0, 1.0
+    fused, policy_map = fuse([even, odd])
+    settings = {"grid": grid, "start": grid.centre_of(0, 0), "goal": grid.centre_of(6, 0)}
+    settings |= {"backend": backend, "tensors": [even, odd]}
+    free = plan(fused, policy_map, **settings)
+    assert free.cost == pytest.approx(6.0) and free.switches == 5
+    # Keeping one policy: three steps at 1 and three at 1 / 0.8.
+    paid = plan(fused, policy_map, switch_cost=1.0, **settings)
+    assert paid.cost == pytest.approx(3 + 3 * 1.25) and paid.switches == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_switch_happens_where_both_policies_are_feasible(backend):
+    grid = flat(9, 2)
+    before, after = np.ones((9, 2, 8)), np.ones((9, 2, 8))
+    before[6:], after[:3] = 0.0, 0.0  # both can leave columns 3, 4 and 5
+    fused, policy_map = fuse([before, after])
+    route = plan(
+        fused,
+        policy_map,
+        grid=grid,
+        start=grid.centre_of(0, 0),
+        goal=grid.centre_of(8, 0),
+        backend=backend,
+        switch_cost=0.5,
+        tensors=[before, after],
+    )
+    assert route.cost == pytest.approx(8.5) and route.switches == 1
+    column = route.cells[np.argmax(route.policies == 1), 0]
+    assert column in (3, 4, 5)
+
+
+def test_one_search_answers_many_starts():
+    tensors, grid, _, goal = random_problem(7)
+    fused, policy_map = fuse(tensors)
+    tree = Planner(fused=fused, policy_map=policy_map, grid=grid).towards(goal)
+    for cell in np.ndindex(grid.shape):
+        start = grid.centre_of(*cell)
+        if not np.isfinite(tree.cost_to_goal[cell]):
+            with pytest.raises(PlanningError):
+                tree.route(start)
+            continue
+        forwards = plan(fused, policy_map, grid=grid, start=start, goal=goal, backend="networkx")
+        assert tree.route(start).cost == pytest.approx(forwards.cost, abs=1e-9)
+        assert tree.cost_to_goal[cell] == pytest.approx(forwards.cost, abs=1e-9)
+
+
+@pytest.mark.parametrize("switch_cost", [0.0, 1.0])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_start_in_the_goals_cell_is_a_route_without_steps(backend, switch_cost):
+    grid = flat(3, 3)
+    closed = np.zeros((3, 3, 8))
+    route = plan(
+        closed,
+        closed,
+        grid=grid,
+        start=(-0.95, 3.05),
+        goal=(-0.85, 3.15),
+        backend=backend,
+        switch_cost=switch_cost,
+        tensors=[closed, closed],
+    )
+    assert route.cells.tolist() == [[0, 0]] and len(route.headings) == 0
+    assert route.cost == route.length == 0 and route.switches == 0
+    assert "one cell" in repr(route)
+    assert Route.from_json(route.to_json()).cells.shape == (1, 2)
+
+
+def one_island():
+    """Return a 5 x 5 map: (4, 4) unknown, (0, 4) closed both ways, (4, 0) an island."""
+    tensor = np.ones((5, 5, 8))
+    known = np.ones((5, 5), dtype=bool)
+    known[4, 4] = False
+    island = {(4, 0), (4, 1)}
+    for ix, iy, heading in np.ndindex(tensor.shape):
+        there = tuple((np.array((ix, iy)) + directions.STEPS[heading]).tolist())
+        if (0, 4) in ((ix, iy), there) or (((ix, iy) in island) != (there in island)):
+            tensor[ix, iy, heading] = 0.05
+    return tensor, flat(5, 5, known)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("cell", "error", "words"),
+    [
+        ((7, 0), OffMapError, "off the map"),
+        ((np.nan, 0), OffMapError, "off the map"),
+        ((4, 4), UnknownCellError, "never observed"),
+        ((0, 4), InfeasibleCellError, "no policy can"),
+        ((4, 0), UnreachableError, "no chain of steps"),
+    ],
+)
+@pytest.mark.parametrize("role", ["start", "goal"])
+def test_errors_say_which_end_where_and_what_to_change(backend, cell, error, words, role):
+    tensor, grid = one_island()
+    ends = {"start": grid.centre_of(2, 2), "goal": grid.centre_of(1, 1)}
+    ends[role] = grid.centre_of(*cell)
+    with pytest.raises(error, match=words) as caught:
+        plan(tensor, np.zeros(tensor.shape), grid=grid, backend=backend, **ends)
+    message = str(caught.value)
+    assert role in message and "{:g}, {:g}".format(*ends[role]) in message
+    assert "move" in message
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_unknown_cells_are_never_silently_free(backend):
+    known = np.ones((5, 2), dtype=bool)
+    known[2] = False
+    grid, tensor = flat(5, 2, known), np.ones((5, 2, 8))
+    settings = {"grid": grid, "start": grid.centre_of(0, 0), "goal": grid.centre_of(4, 0)}
+    with pytest.raises(UnreachableError):
+        plan(tensor, np.zeros(tensor.shape), backend=backend, **settings)
+    route = plan(tensor, np.zeros(tensor.shape), backend=backend, unknown="fill", **settings)
+    assert route.cost == 4
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "words"),
+    [
+        ({"f_min": 0.0}, ConfigError, "f_min must be above 0"),
+        ({"f_min": np.nan}, ConfigError, "f_min"),
+        ({"cost": "time"}, ConfigError, "inverse, length"),
+        ({"backend": "astar"}, ConfigError, "auto, networkx, scipy"),
+        ({"unknown": "free"}, ConfigError, "block, fill"),
+        ({"switch_cost": -1.0}, ConfigError, "switch_cost"),
+        ({"switch_cost": 1.0}, ConfigError, "tensors"),
+        ({"fused": np.ones((3, 4, 8))}, PlanningError, "expected shape"),
+        ({"fused": np.full((3, 3, 8), np.nan)}, PlanningError, "NaN"),
+        ({"policy_map": np.full((3, 3, 8), 2), "names": ["a"]}, PlanningError, "names"),
+        ({"policy_map": np.full((3, 3, 8), -1)}, PlanningError, "policies -1"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(settings, error, words):
+    grid = flat(3, 3)
+    usual = {
+        "fused": np.ones((3, 3, 8)),
+        "policy_map": np.zeros((3, 3, 8)),
+        "grid": grid,
+        "start": grid.centre_of(0, 0),
+        "goal": grid.centre_of(2, 2),
+    }
+    with pytest.raises(error, match=words):
+        plan(**usual | settings)
+
+
+def test_a_route_explains_itself():
+    grid = flat(7, 3)
+    tensors = [torch.from_numpy(tensor).float() for tensor in two_specialists()]
+    fused, policy_map = fuse(tensors)
+    route = plan(
+        fused,
+        policy_map,
+        grid=grid,
+        start=grid.centre_of(0, 1),
+        goal=grid.centre_of(6, 1),
+        tensors=tensors,
+        ood=[torch.ones(7, 3, 8), torch.full((7, 3, 8), 0.25)],
+        names=["walker", "climber"],
+    )
+    steps = route.explain()
+    assert len(steps) == 6 and sum(step["share"] for step in steps) == pytest.approx(1)
+    wall = steps[2]
+    assert wall["policy"] == "climber" and wall["cost"] == 2 and wall["F_max"] == 0.5
+    assert wall["F"] == {"walker": 0.0, "climber": 0.5}
+    assert wall["w_ood"] == {"walker": 1.0, "climber": 0.25}
+    assert directions.NAMES.index(wall["heading"]) in (7, 0, 1)
+    assert json.loads(json.dumps(steps))[2]["policy"] == "climber"
+
+
+def test_a_route_survives_json():
+    tensors, grid, start, goal = random_problem(3)
+    fused, policy_map = fuse(tensors)
+    route = plan(fused, policy_map, grid=grid, start=start, goal=goal, tensors=tensors)
+    again = Route.from_json(json.loads(json.dumps(route.to_json())))
+    assert again.explain() == route.explain() and repr(again) == repr(route)
+    assert (again.xy == route.xy).all() and again.length == route.length
+
+
+@pytest.mark.parametrize(
+    "damage", [{"cells": None}, {"headings": [0]}, {"costs": "many"}, {"length": None}]
+)
+def test_a_damaged_route_is_refused(damage):
+    tensors, grid, start, goal = random_problem(3)
+    fused, policy_map = fuse(tensors)
+    data = plan(fused, policy_map, grid=grid, start=start, goal=goal).to_json()
+    with pytest.raises(PlanningError, match="not a route"):
+        Route.from_json(data | damage)
+
+
+def test_the_readable_graph_holds_what_the_tensor_says():
+    tensor = np.zeros((2, 2, 8))
+    tensor[0, 0, 0], tensor[1, 0, 3], tensor[1, 1, 0] = 0.5, 0.2, 0.9  # the last leaves the map
+    graph = as_networkx(tensor, np.full(tensor.shape, 4))
+    assert sorted(graph.nodes) == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    assert sorted(graph.edges) == [((0, 0), (1, 0)), ((1, 0), (0, 1))]
+    assert graph.edges[(0, 0), (1, 0)] == {
+        "weight": 2.0,
+        "heading": 0,
+        "policy": 4,
+        "feasibility": 0.5,
+    }
+    diagonal = as_networkx(tensor, tensor, cost="length", resolution=0.1).edges[(1, 0), (0, 1)]
+    assert diagonal["weight"] == pytest.approx(5 * 0.1 * 2**0.5)
+
+
+def test_the_switching_graph_needs_both_policies():
+    one, other = np.zeros((2, 2, 8)), np.zeros((2, 2, 8))
+    one[0, 0, 0], other[0, 0, 0], other[0, 1, 0] = 0.5, 1.0, 1.0
+    graph = as_switching_networkx(np.stack((one, other)), 3.0)
+    assert {(tail, head): weight for tail, head, weight in graph.edges(data="weight")} == {
+        ((0, 0, 0), (1, 0, 0)): 2.0,
+        ((0, 0, 1), (1, 0, 0)): 5.0,
+        ((0, 0, 1), (1, 0, 1)): 1.0,
+        ((0, 0, 0), (1, 0, 1)): 4.0,
+        ((0, 1, 1), (1, 1, 1)): 1.0,
+    }
