@@ -1,6 +1,7 @@
 """The exceptions of fgtutor: each says what was expected, what came, and what to do next.
 
-All derive from `FgtutorError`, itself a `ValueError`, so one `except` at a stage boundary is enough.
+All derive from `FgtutorError`, itself a `ValueError`, so one `except` at a stage boundary is
+enough.
 """
 
 

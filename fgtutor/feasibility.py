@@ -17,16 +17,14 @@ from torch import Tensor, nn
 from fgtutor.errors import ThresholdError
 
 TAU_LOW, TAU_HIGH = 0.1, 2.0
-"""The paper's thresholds on L_recon, m^2 summed over the patch (Eq. 4)."""
-SIGMA = 0.25
-"""The paper's scale of the velocity error, m/s (Eq. 1)."""
+"""The paper's thresholds on L_recon, summed over the patch (Eq. 4)."""
 
 
 class FeasibilityNet(nn.Module):
     """An MLP head for feasibility beside a variational autoencoder of patches (paper, Fig. 2).
 
-    Every layer that touches the patch is plain and linear first (no clipping, no normalisation) and
-    the decoder ends in a linear layer: `tensorization` relies on both.
+    Patches enter times a fixed `height_scale`, never clipped or normalised one by one: what a layer
+    sees stays a linear function of the map, which `tensorization` relies on.
     """
 
     def __init__(
@@ -35,30 +33,46 @@ class FeasibilityNet(nn.Module):
         *,
         command_dim: int = 3,
         hidden: tuple[int, int] = (128, 64),
+        vae_hidden: tuple[int, int] = (256, 128),
         latent: int = 16,
+        height_scale: float = 4.0,
     ) -> None:
-        """Build the three networks; widths other than the patch's are TRAINING defaults."""
+        """Build the head and the two halves of the autoencoder.
+
+        Args:
+            num_points: Points of a patch.
+            command_dim: Numbers in a command.
+            hidden: Widths of the head.
+            vae_hidden: Widths of the encoder; the decoder mirrors them.
+            latent: Width of the latent.
+            height_scale: Units of height per metre. At 4 a unit is 0.25 m, a tall step for these
+                robots; then the paper's tau = 0.1 and 2.0 lie between known and unknown terrain.
+        """
         super().__init__()
         self.num_points, self.command_dim = num_points, command_dim
-        self.hidden, self.latent = tuple(hidden), latent
-        wide, narrow = self.hidden
-        self.head = _mlp(num_points + command_dim, wide, narrow, 1)
-        self.encoder = _mlp(num_points, wide, narrow, 2 * latent)
-        self.decoder = _mlp(latent, narrow, wide, num_points)
+        self.hidden, self.vae_hidden = tuple(hidden), tuple(vae_hidden)
+        self.latent, self.height_scale = latent, height_scale
+        wide, narrow = self.vae_hidden
+        self.head = _mlp(nn.ELU, num_points + command_dim, hidden[0], hidden[1], 1)
+        # tanh saturates: unlike ELU it cannot extrapolate to terrain steeper than any it has seen.
+        self.encoder = _mlp(nn.Tanh, num_points, wide, narrow, 2 * latent)
+        self.decoder = _mlp(nn.Tanh, latent, narrow, wide, num_points)
 
     def feasibility(
         self, patch: Float[Tensor, "*batch points"], command: Float[Tensor, "*batch command"]
     ) -> Float[Tensor, "*batch"]:
         """Predict the tracking reward r_v, in [0, 1], of this command on this patch."""
-        return torch.sigmoid(self.head(torch.cat((patch, command), dim=-1))).squeeze(-1)
+        inputs = torch.cat((self.height_scale * patch, command), dim=-1)
+        return torch.sigmoid(self.head(inputs)).squeeze(-1)
 
     def reconstruction(self, patch: Float[Tensor, "*batch points"]) -> Float[Tensor, "*batch"]:
-        """Return L_recon, m^2: the squared height error SUMMED over the patch.
+        """Return L_recon: the squared height error SUMMED over the patch, in scaled units.
 
         It decodes the latent mean, so the same patch always gets the same answer.
         """
-        mean, _ = self.encoder(patch).chunk(2, dim=-1)
-        return (self.decoder(mean) - patch).square().sum(dim=-1)
+        heights = self.height_scale * patch
+        mean, _ = self.encoder(heights).chunk(2, dim=-1)
+        return (self.decoder(mean) - heights).square().sum(dim=-1)
 
     def loss(
         self,
@@ -74,7 +88,8 @@ class FeasibilityNet(nn.Module):
         Eqs. 2-3 with the paper's alpha and beta. In training mode the latent is sampled (and
         reparameterised, with `generator` if given); in evaluation mode it is the mean.
         """
-        mean, log_variance = self.encoder(patch).chunk(2, dim=-1)
+        heights = self.height_scale * patch
+        mean, log_variance = self.encoder(heights).chunk(2, dim=-1)
         latent = mean
         if self.training:
             noise = torch.empty_like(mean).normal_(generator=generator)
@@ -82,20 +97,11 @@ class FeasibilityNet(nn.Module):
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)
         parts = {
             "feasibility": (self.feasibility(patch, command) - r_v).square().mean(),
-            "reconstruction": (self.decoder(latent) - patch).square().sum(dim=-1).mean(),
+            "reconstruction": (self.decoder(latent) - heights).square().sum(dim=-1).mean(),
             "kl": divergence.mean(),
         }
         total = parts["feasibility"] + alpha * (parts["reconstruction"] + beta * parts["kl"])
         return total, parts
-
-
-def tracking_reward(
-    velocity: Float[Tensor, "*batch axes"],
-    command: Float[Tensor, "*batch axes"],
-    sigma: float = SIGMA,
-) -> Float[Tensor, "*batch"]:
-    """Return r_v = exp(-||v - v_cmd||_2 / sigma), in (0, 1] (Eq. 1: the norm, not its square)."""
-    return torch.exp(-torch.linalg.vector_norm(velocity - command, dim=-1) / sigma)
 
 
 @overload
@@ -126,30 +132,35 @@ def ood_weight(
 
 
 def calibrated_taus(quantiles: Mapping[str, float]) -> tuple[float, float]:
-    """Return (tau_low, tau_high) from quantiles of L_recon on the specialist's own terrain.
+    """Return (tau_low, tau_high): the 90 % and 99 % quantiles of L_recon on the own terrain.
 
-    tau_low is the 95 % quantile: nearly all of the own terrain keeps full weight. tau_high is twice
-    the 99 % quantile, and at least twice tau_low: a patch reconstructed worse than that is as good
-    as unseen. Raises `ThresholdError` if "0.95" or "0.99" is missing or is not a positive number.
+    So nine tenths of the own terrain keep full weight, and what is reconstructed worse than all but
+    a hundredth of it counts as never seen. Raises `ThresholdError` if "0.9" or "0.99" is missing or
+    the two are not positive and increasing.
     """
     try:
-        q95, q99 = float(quantiles["0.95"]), float(quantiles["0.99"])
+        low, high = float(quantiles["0.9"]), float(quantiles["0.99"])
     except (KeyError, TypeError, ValueError) as error:
         raise ThresholdError(
-            f'calibrated taus need the quantiles "0.95" and "0.99" of L_recon, got '
+            f'calibrated taus need the quantiles "0.9" and "0.99" of L_recon, got '
             f'{dict(quantiles)}: train the specialist again, or use taus="paper"'
         ) from error
-    if not (0 < q95 <= q99 < math.inf):
+    if not (0 < low < high < math.inf):
         raise ThresholdError(
-            f"quantiles of L_recon must be positive and increasing, got q95 = {q95}, q99 = {q99}: "
+            f"quantiles of L_recon must be positive and increasing, got q90 = {low}, q99 = {high}: "
             'train the specialist again, or use taus="paper"'
         )
-    return q95, 2 * max(q95, q99)
+    return low, high
 
 
-def _mlp(inputs: int, first: int, second: int, outputs: int) -> nn.Sequential:
-    """Build linear - ELU - linear - ELU - linear."""
+def _mlp(
+    activation: type[nn.Module], inputs: int, first: int, second: int, outputs: int
+) -> nn.Sequential:
+    """Build linear - activation - linear - activation - linear."""
     return nn.Sequential(
-        nn.Linear(inputs, first), nn.ELU(), nn.Linear(first, second), nn.ELU(),
+        nn.Linear(inputs, first),
+        activation(),
+        nn.Linear(first, second),
+        activation(),
         nn.Linear(second, outputs),
-    )  # fmt: skip
+    )

@@ -35,6 +35,12 @@ class TerrainScale:
     """Lowest and highest riser at difficulty 1, m."""
     step_tread: tuple[float, float] = (0.35, 0.65)
     """Shortest and longest tread of a flight of steps, m."""
+    block_share: float = 0.4
+    """Share of fields of blocks among steps; the others are flights."""
+    lane_share: float = 0.4
+    """Share of flights and hills that differ between a left and a right lane."""
+    bank_share: float = 0.5
+    """Share of hills whose plateau is banked sideways."""
     gap_width: tuple[float, float] = (0.05, 0.15)
     """Width of a gap, m."""
     platform: tuple[float, float] = (0.8, 1.6)
@@ -61,6 +67,8 @@ class TerrainScale:
     """Highest block of rubble at difficulty 1, m."""
     rubble_size: tuple[float, float] = (0.2, 0.5)
     """Shortest and longest side of a block of rubble, m."""
+    rubble_density: float = 1.5
+    """Area of all blocks of rubble over the area they lie on; above 1 hardly any ground is left."""
     mixed: tuple[str, ...] = ("steps", "gaps", "bridge", "valley")
     """The obstacles of the mixed terrain; their order is drawn from the seed."""
     mixed_section: float = 3.0
@@ -76,14 +84,20 @@ SCALES = {
         length=9.0,
         chasm_depth=(0.05, 0.5, 1.0),
         step_height=(0.06, 0.15),
-        step_tread=(0.4, 0.7),
+        # A toy drives in a slice: what differs beside it would only blur what its terrains are.
+        block_share=0.0,
+        lane_share=0.0,
+        bank_share=0.0,
+        step_tread=(0.75, 1.1),
         gap_width=(0.1, 0.3),
         bridge_width=(1.6, 0.6),
         slope_angle=(8.0, 40.0),
         slope_height=0.7,
         stair_rise=0.16,
         stair_run=0.4,
-        rubble_height=0.12,
+        rubble_height=0.11,
+        rubble_size=(0.1, 0.2),
+        rubble_density=0.3,
         mixed=("steps", "gaps", "slopes", "rubble"),
     ),
 }
@@ -174,7 +188,8 @@ class Course:
         """Return the whole width, or sometimes two lanes with the border beside the middle."""
         width = self.width
         cut = self.snap(width * (0.5 + self.dice.choice((-1, 1)) * self.dice.uniform(0.15, 0.3)))
-        return [(0.0, cut), (cut, width)] if self.dice.random() < 0.4 else [(0.0, width)]
+        split = self.dice.random() < self.scale.lane_share
+        return [(0.0, cut), (cut, width)] if split else [(0.0, width)]
 
 
 def _flat(course: Course, x0: float, x1: float) -> float:
@@ -186,7 +201,7 @@ def _steps(course: Course, x0: float, x1: float) -> float:
     """Lay flights of steps and fields of blocks, one after another, with short landings."""
     borders = course.cuts(x1 - x0, 1.8, 2.8)
     for near, far in pairwise(borders):
-        kind = _flight if course.dice.random() < 0.6 else _blocks
+        kind = _blocks if course.dice.random() < course.scale.block_share else _flight
         # Without a landing, a flight up beside one down would make a riser of twice the height.
         end = far if far == borders[-1] else course.snap(far - 0.4)
         kind(course, x0 + near, x0 + end)
@@ -289,7 +304,7 @@ def _hill(course: Course, x0: float, x1: float, y0: float, y1: float, *, banked:
     course.ramp_x(top1, x1, y0, y1, top, 0.0)
     tilt = math.tan(math.radians(steepest * dice.uniform(0.15, 0.3))) * dice.choice((-1, 1))
     rise, flat = float(tilt * (y1 - y0) / 2), course.snap(0.2)
-    if banked and dice.random() < 0.5 and top1 - top0 > 3 * flat:
+    if banked and dice.random() < scale.bank_share and top1 - top0 > 3 * flat:
         course.block(top0, top0 + flat, y0, y1, top)
         course.ramp_y(top0 + flat, top1 - flat, y0, y1, top - rise, top + rise)
         course.block(top1 - flat, top1, y0, y1, top)
@@ -315,11 +330,11 @@ def _stairs(course: Course, x0: float, x1: float) -> float:
 
 
 def _rubble(course: Course, x0: float, x1: float) -> float:
-    """Strew small blocks of random size and height, dense enough that none can be walked around."""
+    """Strew small blocks of random size and height."""
     course.full(x0, x1)
     width = course.width
     low, high = course.scale.rubble_size
-    count = int(1.5 * (x1 - x0) * width / (0.5 * (low + high)) ** 2)
+    count = int(course.scale.rubble_density * (x1 - x0) * width / (0.5 * (low + high)) ** 2)
     for _ in range(count):
         length, breadth = course.draw(low, high), course.draw(low, high)
         # Blocks may begin before the border and are cut there, or the border would stay bare.

@@ -30,7 +30,7 @@ class PatchGrid:
     spacing: float = 0.1
     """Distance between neighbouring points, m."""
     footprint: tuple[float, float] = (0.2, 0.1)
-    """Half length and half width of the area whose median height is the ground under the robot, m."""
+    """Half length and half width of the area whose median is the ground under the robot, m."""
 
     def __post_init__(self) -> None:
         if not (self.spacing > 0 and self.ahead >= 0 and self.behind >= 0 and self.half_width >= 0):
@@ -100,8 +100,12 @@ def sample_heights(
     a, b = u - i, v - j
     flat, base = heights.reshape(-1), i * ny + j
     right, up = ny * (nx > 1), int(ny > 1)
-    near = flat[base] * (1 - b) + flat[base + up] * b
-    far = flat[base + right] * (1 - b) + flat[base + right + up] * b
+
+    def at(cell: Tensor) -> Tensor:  # several times faster than flat[cell]
+        return flat.index_select(0, cell.reshape(-1)).reshape(cell.shape)
+
+    near = at(base) * (1 - b) + at(base + up) * b
+    far = at(base + right) * (1 - b) + at(base + right + up) * b
     return near * (1 - a) + far * a
 
 
@@ -130,9 +134,9 @@ def sample_patches(
 ) -> Float[Tensor, "*batch points"]:
     """Cut the yaw-aligned patch H_xy at each pose (x, y, yaw), relative to the ground beneath it.
 
-    `heights` comes from a prepared map (see `prepare`). The rotation to the heading happens here, so
-    a patch always looks along the way the robot faces. Raises `ConfigError` if a pose or a height
-    near it is not finite, since a NaN would spread through the whole batch.
+    `heights` comes from a prepared map (see `prepare`). The rotation to the heading happens here,
+    so a patch always looks along the way the robot faces. Raises `ConfigError` if a pose or a
+    height near it is not finite, since a NaN would spread through the whole batch.
     """
     offsets = rotate(grid.points.to(heights), poses[..., 2])
     points = poses[..., None, :2] + offsets

@@ -15,8 +15,9 @@ from tensordict import TensorDict
 from torch import nn
 
 from fgtutor.errors import SpecialistError
+from fgtutor.symmetry import SymmetricMLPModel
 
-POLICIES: dict[str, type[MLPModel]] = {"mlp": MLPModel}
+POLICIES: dict[str, type[MLPModel]] = {"mlp": MLPModel, "symmetric": SymmetricMLPModel}
 """Policy classes that a folder may name; `register_policy` adds one."""
 _DISTRIBUTION_OPTIONS = ("std_type", "std_range")
 _ACTIVATIONS = ("elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu")

@@ -231,7 +231,7 @@ def load_zoo(
 
 def _numbers(net: FeasibilityNet) -> dict[str, Any]:
     """Return the arguments that build a Feasibility-Net of this size."""
-    names = ("num_points", "command_dim", "hidden", "latent")
+    names = ("num_points", "command_dim", "hidden", "vae_hidden", "latent", "height_scale")
     return {name: getattr(net, name) for name in names}
 
 

@@ -51,7 +51,7 @@ def make_specialist() -> Callable[..., Specialist]:
                     "std_type": "log",
                 },
             )
-            net = FeasibilityNet(grid.num_points, hidden=(16, 8), latent=4)
+            net = FeasibilityNet(grid.num_points, hidden=(16, 8), vae_hidden=(16, 8), latent=4)
         values = {
             "name": name,
             "robot": "toy",
@@ -87,7 +87,7 @@ def make_rolling(make_specialist) -> Callable[..., Specialist]:
             activation="elu",
             distribution_cfg={"class_name": GaussianDistribution, "std_type": "log"},
         )
-        net = FeasibilityNet(probe.grid.num_points, hidden=(8, 8), latent=2)
+        net = FeasibilityNet(probe.grid.num_points, hidden=(8, 8), vae_hidden=(8, 8), latent=2)
         with torch.no_grad():
             for parameter in (*policy.parameters(), *net.parameters()):
                 parameter.zero_()

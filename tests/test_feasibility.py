@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fgtutor.errors import ThresholdError
-from fgtutor.feasibility import FeasibilityNet, calibrated_taus, ood_weight, tracking_reward
+from fgtutor.feasibility import FeasibilityNet, calibrated_taus, ood_weight
 
 POINTS = 6
 
@@ -17,7 +17,7 @@ POINTS = 6
 @pytest.fixture
 def net() -> FeasibilityNet:
     torch.manual_seed(0)
-    return FeasibilityNet(POINTS, hidden=(8, 4), latent=3)
+    return FeasibilityNet(POINTS, hidden=(8, 4), vae_hidden=(8, 4), latent=3, height_scale=1.0)
 
 
 @pytest.fixture
@@ -27,12 +27,6 @@ def blank(net: FeasibilityNet) -> FeasibilityNet:
         for parameter in net.parameters():
             parameter.zero_()
     return net
-
-
-def test_tracking_reward_uses_the_norm_not_its_square():
-    # v - v_cmd = (0.3, 0.4), norm 0.5, 0.5 / 0.25 = 2; squared it would be exp(-1).
-    reward = tracking_reward(torch.tensor([[0.3, 0.4], [0.0, 0.0]]), torch.zeros(2, 2))
-    torch.testing.assert_close(reward, torch.tensor([math.exp(-2), 1.0]))
 
 
 @pytest.mark.parametrize(
@@ -68,12 +62,12 @@ def test_ood_weight_never_grows_with_the_loss(one, other, low, width):
 
 
 def test_calibrated_taus_come_from_the_own_terrain():
-    assert calibrated_taus({"0.95": 0.2, "0.99": 0.4}) == (0.2, 0.8)
+    assert calibrated_taus({"0.9": 0.2, "0.95": 0.3, "0.99": 0.4}) == (0.2, 0.4)
 
 
 @pytest.mark.parametrize(
     "quantiles",
-    [{}, {"0.95": 0.2}, {"0.95": 0.4, "0.99": 0.2}, {"0.95": 0.0, "0.99": 1.0}, {"0.95": "x"}],
+    [{}, {"0.9": 0.2}, {"0.9": 0.4, "0.99": 0.2}, {"0.9": 0.0, "0.99": 1.0}, {"0.9": "x"}],
 )
 def test_calibrated_taus_say_what_is_missing(quantiles):
     with pytest.raises(ThresholdError, match="train the specialist again"):
@@ -91,6 +85,12 @@ def test_outputs_have_the_shape_of_the_batch(net, batch):
 def test_reconstruction_is_a_sum_over_points(blank):
     # Reconstructing zeros: 6 points of 0.5 m are 6 * 0.25 = 1.5 m^2, not their mean 0.25.
     assert blank.reconstruction(torch.full((POINTS,), 0.5)).item() == pytest.approx(1.5)
+
+
+def test_the_height_scale_enters_squared(blank):
+    blank.height_scale = 4.0
+    # 6 points of 0.5 m are 2 units of 0.25 m each: 6 * 4 = 24.
+    assert blank.reconstruction(torch.full((POINTS,), 0.5)).item() == pytest.approx(24.0)
 
 
 def test_reconstruction_is_the_same_in_training_mode(net):

@@ -1,0 +1,1 @@
+"""Measuring what was built: success rates with intervals, one module per experiment."""

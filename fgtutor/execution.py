@@ -1,0 +1,292 @@
+"""Driving a planned route in simulation: follow it, and switch to the policy that each edge names.
+
+Reads routes, terrains and specialists; gives an `Episode` each. Trials run side by side: one
+environment holds all terrains as tiles of one world.
+Source: paper, Sec. III-C (policy map P) and Sec. IV-B (what counts as a failure); the follower is
+pure pursuit (Coulter, 1992).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from tqdm import tqdm
+
+from fgtutor.errors import ConfigError
+from fgtutor.planning import Route
+from fgtutor.robots import env_class
+from fgtutor.robots.base import LocomotionEnv, turn_rate
+from fgtutor.specialist import Specialist
+from fgtutor.terrain import Terrain, World
+
+
+@dataclass(frozen=True, kw_only=True)
+class FollowConfig:
+    """How a route is followed, and when an episode is over."""
+
+    lookahead: float = 0.45
+    """Distance to the point on the route that the robot steers for, m."""
+    goal_radius: float = 0.35
+    """The goal is reached within this distance of it, m."""
+    patience: float = 3.0
+    """Time limit as a multiple of route length / speed, plus `grace`."""
+    grace: float = 5.0
+    """Seconds added to the time limit."""
+    hold_steps: int = 3
+    """Hysteresis: a policy takes over once it has been wanted for this many control steps."""
+    start_noise: float = 0.03
+    """Standard deviation of the start position, m."""
+    start_yaw_noise: float = 0.03
+    """Standard deviation of the start yaw, rad."""
+    position_noise: float = 0.0
+    """Standard deviation of each localisation fix, m; only the follower is misled by it."""
+    drift: float = 0.0
+    """Growth of the localisation error, m per square root of a second (a random walk)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One driven route."""
+
+    success: bool
+    """Whether the goal was reached in time and without a fall."""
+    reason: str
+    """reached | fell | timeout"""
+    poses: Float[np.ndarray, "steps 4"]
+    """Chassis or trunk poses (x, y, z, yaw) in the terrain's frame, one per control step."""
+    policies: Int[np.ndarray, "steps"]
+    """Index of the active policy at each step, into the route's policy names."""
+    length: float
+    """Distance driven in the plane, m."""
+    seconds: float
+    """Simulated time, s."""
+    body: Float[np.ndarray, "steps features"] | None = None
+    """What a figure needs to draw the robot (see `LocomotionEnv.drawing`), if it was recorded."""
+
+    @property
+    def switches(self) -> int:
+        """How often the policy changed."""
+        return int(np.count_nonzero(np.diff(self.policies)))
+
+    def __repr__(self) -> str:
+        return (
+            f"Episode({self.reason}, {self.length:.2f} m in {self.seconds:.1f} s, "
+            f"{self.switches} switches)"
+        )
+
+
+def execute(
+    route: Route,
+    terrain: Terrain,
+    zoo: Mapping[str, Specialist],
+    *,
+    seed: int = 0,
+    config: FollowConfig | None = None,
+    progress: bool = False,
+) -> Episode:
+    """Drive one route and record the robot's body, so that the episode can be drawn."""
+    return execute_batch(
+        [route], [terrain], zoo, seeds=[seed], config=config, record_body=True, progress=progress
+    )[0]
+
+
+def execute_batch(
+    routes: Sequence[Route],
+    terrains: Sequence[Terrain],
+    zoo: Mapping[str, Specialist],
+    *,
+    seeds: Sequence[int],
+    config: FollowConfig | None = None,
+    record_body: bool = False,
+    progress: bool = False,
+) -> list[Episode]:
+    """Drive route i on terrain i with the policies of `zoo`, all at once; return the episodes.
+
+    A route's policy indices count in the order of `zoo`. Raises `ConfigError` if the lists differ
+    in length, the zoo is empty or mixes robots, or a route names a policy that `zoo` lacks.
+    """
+    settings = config or FollowConfig()
+    if not (len(routes) == len(terrains) == len(seeds)):
+        raise ConfigError(
+            f"need one route, terrain and seed per trial, got {len(routes)}, {len(terrains)} and "
+            f"{len(seeds)}"
+        )
+    if not routes:
+        return []
+    specialists = list(zoo.values())
+    robots = {specialist.robot for specialist in specialists}
+    if len(robots) != 1:
+        raise ConfigError(f"a zoo to drive with holds one robot's policies, got {sorted(robots)}")
+    wanted = max((int(route.policies.max()) for route in routes if len(route.policies)), default=0)
+    if wanted >= len(specialists):
+        raise ConfigError(
+            f"a route uses policy number {wanted}, but the zoo holds {len(specialists)}: execute a "
+            "route with the zoo that it was planned with"
+        )
+    robot = env_class(robots.pop())
+    episodes = replace(robot.episodes, train=False, stuck_seconds=math.inf)
+    env = robot(World([list(terrains)]), len(routes), config=episodes)
+    return _Drive(env, routes, specialists, seeds, settings).run(record_body, progress)
+
+
+class _Drive:
+    """A batch of robots on their routes, from the first step to the last one's end."""
+
+    def __init__(
+        self,
+        env: LocomotionEnv,
+        routes: Sequence[Route],
+        specialists: Sequence[Specialist],
+        seeds: Sequence[int],
+        config: FollowConfig,
+    ) -> None:
+        self.env, self.specialists, self.config = env, specialists, config
+        self.tracks = [_Track(route) for route in routes]
+        self.speed = min(specialist.command[0] for specialist in specialists)
+        self.corners = env.offsets[0].cpu().numpy().astype(np.float64)
+        self.dice = [np.random.default_rng(seed) for seed in seeds]
+        self.limits = np.array(
+            [
+                (config.patience * track.length / self.speed + config.grace) / env.control_dt
+                for track in self.tracks
+            ]
+        )
+        n = len(routes)
+        self.error = np.zeros((n, 2))
+        self.active = np.array([track.policy for track in self.tracks])
+        self.waiting = np.zeros(n, dtype=int)
+        env.row = torch.zeros(n, dtype=torch.long)
+        env.column = torch.arange(n)
+        starts = [
+            (
+                *(track.points[0] + corner + config.start_noise * dice.standard_normal(2)),
+                track.yaw + config.start_yaw_noise * dice.standard_normal(),
+            )
+            for track, corner, dice in zip(self.tracks, self.corners, self.dice, strict=True)
+        ]
+        poses = torch.tensor(np.array(starts), dtype=torch.float32)
+        env.start(torch.arange(n), poses, self.speed)
+
+    def run(self, record_body: bool, progress: bool) -> list[Episode]:
+        """Step until every robot has reached its goal, fallen or run out of time."""
+        n = len(self.tracks)
+        reason: list[str | None] = [None] * n
+        poses: list[list[np.ndarray]] = [[] for _ in range(n)]
+        policies: list[list[int]] = [[] for _ in range(n)]
+        bodies: list[list[np.ndarray]] = [[] for _ in range(n)]
+        with tqdm(total=n, unit="trial", disable=not progress) as bar:
+            for step in range(1, math.ceil(self.limits.max()) + 1):
+                self._command(self._pose())
+                with torch.inference_mode():
+                    actions = self._act()
+                    _, _, _, extras = self.env.step(actions)
+                pose, fell = self._pose(), extras["fell"].cpu().numpy()
+                drawing = self.env.drawing() if record_body else None
+                for i in range(n):
+                    if reason[i] is not None:
+                        continue
+                    poses[i].append(pose[i])
+                    policies[i].append(int(self.active[i]))
+                    if drawing is not None:
+                        bodies[i].append(drawing[i])
+                    away = np.hypot(*(pose[i, :2] - self.tracks[i].points[-1]))
+                    if fell[i]:
+                        reason[i] = "fell"
+                    elif away <= self.config.goal_radius:
+                        reason[i] = "reached"
+                    elif step >= self.limits[i]:
+                        reason[i] = "timeout"
+                    bar.update(reason[i] is not None)
+                if None not in reason:
+                    break
+        return [
+            Episode(
+                success=reason[i] == "reached",
+                reason=reason[i] or "timeout",
+                poses=np.array(poses[i]),
+                policies=np.array(policies[i]),
+                length=float(np.hypot(*np.diff(np.array(poses[i])[:, :2], axis=0).T).sum()),
+                seconds=len(poses[i]) * self.env.control_dt,
+                body=np.array(bodies[i]) if record_body else None,
+            )
+            for i in range(n)
+        ]
+
+    def _pose(self) -> Float[np.ndarray, "trials 4"]:
+        """Return the true poses, each in its own terrain's frame."""
+        pose = self.env.motion()[0].cpu().numpy().astype(np.float64)
+        pose[:, :2] -= self.corners
+        return pose
+
+    def _command(self, pose: Float[np.ndarray, "trials 4"]) -> None:
+        """Command (v, 0, w) by pure pursuit from where each robot believes it is."""
+        config, n = self.config, len(self.tracks)
+        if config.drift or config.position_noise:
+            fixes = np.array([dice.standard_normal((2, 2)) for dice in self.dice])
+            self.error += config.drift * math.sqrt(self.env.control_dt) * fixes[:, 0]
+            believed = pose[:, :2] + self.error + config.position_noise * fixes[:, 1]
+        else:
+            believed = pose[:, :2]
+        aims = np.zeros(n)
+        for i, track in enumerate(self.tracks):
+            track.advance(believed[i])
+            aim = track.ahead(config.lookahead) - believed[i]
+            aims[i] = math.atan2(aim[1], aim[0]) if np.hypot(*aim) > 1e-3 else pose[i, 3]
+            self._choose(i, track.policy)
+        yaw = torch.as_tensor(pose[:, 3], dtype=torch.float32)
+        turn = turn_rate(
+            torch.as_tensor(aims, dtype=torch.float32), yaw, self.env.config.max_turn_rate
+        )
+        self.env.command[:, 0] = self.speed
+        self.env.command[:, 2] = turn.to(self.env.command)
+
+    def _choose(self, i: int, wanted: int) -> None:
+        """Switch robot i's policy once another has been wanted for long enough."""
+        self.waiting[i] = self.waiting[i] + 1 if wanted != self.active[i] else 0
+        if self.waiting[i] >= self.config.hold_steps:
+            self.active[i], self.waiting[i] = wanted, 0
+
+    def _act(self) -> Tensor:
+        """Ask each robot's active policy for its action."""
+        observations = self.env.get_observations()
+        actions = torch.zeros(len(self.tracks), self.env.num_actions, device=self.env.device)
+        for index, specialist in enumerate(self.specialists):
+            mine = torch.as_tensor(np.flatnonzero(self.active == index))
+            if len(mine):
+                actions[mine] = specialist.act(observations[mine])
+        return actions
+
+
+class _Track:
+    """A route resampled every `SPACING` metres, which remembers how far along it the robot is."""
+
+    SPACING = 0.02
+
+    def __init__(self, route: Route) -> None:
+        xy = np.asarray(route.xy, dtype=np.float64)
+        at = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))))
+        self.length = float(at[-1])
+        distance = np.append(np.arange(0.0, self.length, self.SPACING), self.length)
+        edge = np.clip(np.searchsorted(at, distance, "right") - 1, 0, max(len(at) - 2, 0))
+        self.points = np.stack([np.interp(distance, at, xy[:, axis]) for axis in (0, 1)], axis=-1)
+        self.policies = np.asarray(route.policies)[edge] if len(at) > 1 else np.zeros(1, dtype=int)
+        self.yaw = math.atan2(*(xy[1] - xy[0])[::-1]) if len(at) > 1 else 0.0
+        self.nearest = 0
+
+    @property
+    def policy(self) -> int:
+        """The policy that the route names where the robot is."""
+        return int(self.policies[self.nearest])
+
+    def ahead(self, distance: float) -> np.ndarray:
+        """Return the point `distance` metres further along; the end of the route beyond it."""
+        return self.points[min(self.nearest + round(distance / self.SPACING), len(self.points) - 1)]
+
+    def advance(self, place: np.ndarray, window: float = 1.0) -> None:
+        """Move to the nearest point of the route within `window` metres ahead; never back."""
+        reach = self.points[self.nearest : self.nearest + round(window / self.SPACING)]
+        self.nearest += int(np.argmin(((reach - place) ** 2).sum(axis=1)))

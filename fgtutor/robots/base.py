@@ -1,0 +1,343 @@
+"""The seam between learning and simulation: a batch of robots that track velocity commands.
+
+`LocomotionEnv` is rsl_rl's `VecEnv`. It owns what every robot shares: the world of terrain tiles,
+commands, patches at the robots' poses, the tracking reward, time-outs, the curriculum and placing
+robots for evaluation. A robot adds its physics in a handful of members (see the abstract methods).
+Source: paper, Sec. III-A (Eq. 1); world of difficulty rows as in Rudin et al., CoRL 2021.
+"""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from fgtutor import patches
+from fgtutor.errors import ConfigError
+from fgtutor.patches import PatchGrid, sample_patches
+from fgtutor.symmetry import Mirror
+from fgtutor.terrain import World
+
+SIGMA = 0.25
+"""Scale of the tracking reward, m/s (paper, Eq. 1)."""
+
+
+def tracking_reward(
+    velocity: Float[Tensor, "*batch 2"], command: Float[Tensor, "*batch 2"], sigma: float = SIGMA
+) -> Float[Tensor, "*batch"]:
+    """Return r_v = exp(-||v - v_cmd||_2 / sigma), in (0, 1] (paper, Eq. 1: the norm, unsquared)."""
+    return torch.exp(-(velocity - command).norm(dim=-1) / sigma)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """How episodes are drawn and ended; the robot's own numbers live beside the robot."""
+
+    speed: tuple[float, float] = (0.7, 1.0)
+    """Range of the commanded forward speed, m/s."""
+    max_turn_rate: float = 1.5
+    """Limit of the commanded turn rate, rad/s."""
+    episode_seconds: float = 8.0
+    """Time limit of an episode, s."""
+    stuck_seconds: float = 2.0
+    """An episode without `stuck_progress` for this long has failed, s; waiting must not pay."""
+    stuck_progress: float = 0.05
+    """Progress that counts as moving, m."""
+    traverse_share: float = 0.6
+    """Share of episodes that start at a tile's end and cross it; the others start anywhere."""
+    turn_share: float = 0.15
+    """Share of episodes whose heading changes on the way, as a route's does."""
+    promote_above: float = 0.5
+    """Mean r_v of an unfailed episode from which its robot moves to a harder row."""
+    demote_below: float = 0.3
+    """Mean r_v of an episode below which its robot moves to an easier row; so does a failure."""
+    start_row: int = 0
+    """Row on which training starts."""
+    train: bool = True
+    """Draw new episodes when one ends; False leaves finished robots where they are."""
+
+
+def plain_tensors(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Run a method so that what it makes are ordinary tensors without gradients.
+
+    rsl_rl collects rollouts under `inference_mode`, whose tensors could not be written to
+    afterwards.
+    """
+    return torch.inference_mode(False)(torch.no_grad()(method))
+
+
+class LocomotionEnv(VecEnv):
+    """A batch of robots on a `World`, with observation groups {policy, patch, command, tracking}.
+
+    The `tracking` group holds, for the step just taken, (r_v, failed, ended): r_v is 0 once a robot
+    has failed, so a fall can never look feasible.
+    """
+
+    grid: PatchGrid
+    """Where patches are sampled; the robot chooses."""
+    control_dt: float
+    """Seconds between two actions."""
+    episodes: EnvConfig = EnvConfig()
+    """How this robot's episodes are drawn unless the caller says otherwise."""
+    mirror: Mirror | None = None
+    """The robot's left-right symmetry; with one, its policies are made symmetric."""
+
+    @plain_tensors
+    def __init__(
+        self,
+        world: World,
+        num_envs: int,
+        *,
+        config: EnvConfig | None = None,
+        seed: int = 0,
+        device: str = "cpu",
+    ) -> None:
+        """Prepare buffers; the subclass builds its physics, then calls `reset_all`."""
+        if num_envs < 1:
+            raise ConfigError(f"num_envs must be at least 1, got {num_envs}")
+        self.world, self.num_envs, self.device = world, num_envs, device
+        self.config = config or self.episodes
+        self.cfg = self.config
+        self.max_episode_length = round(self.config.episode_seconds / self.control_dt)
+        prepared = world.lay(patches.prepare)
+        self.heights = torch.tensor(prepared.heights, device=device)
+        self.resolution, self.origin = prepared.resolution, prepared.origin
+        self.offsets = torch.as_tensor(world.offset, dtype=torch.float32, device=device)
+        self.num_rows, self.num_columns = self.offsets.shape[:2]
+        self.tile_size = torch.tensor(
+            world.tiles[0][0].elevation.size, dtype=torch.float32, device=device
+        )
+
+        self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long, device=device)
+        self.row = torch.full((num_envs,), min(self.config.start_row, self.num_rows - 1))
+        self.column = torch.arange(num_envs) % self.num_columns
+        self.command = torch.zeros(num_envs, 3, device=device)
+        self.target_yaw = torch.zeros(num_envs, device=device)
+        self.anchor = torch.zeros(num_envs, 2, device=device)
+        self.turning = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.tracking = torch.zeros(num_envs, 3, device=device)
+        self.return_r_v = torch.zeros(num_envs, device=device)
+        self.stuck_from = torch.zeros(num_envs, 2, device=device)
+        self.stuck_steps = torch.zeros(num_envs, dtype=torch.long, device=device)
+        self.reseed(seed)
+
+    # What a robot adds ------------------------------------------------------------------------
+
+    @abstractmethod
+    def place(self, ids: Int[Tensor, "n"], poses: Float[Tensor, "n 3"]) -> None:
+        """Put robots at rest, in their stance, on the ground at (x, y, yaw)."""
+
+    @abstractmethod
+    def advance(self, actions: Float[Tensor, "envs actions"]) -> None:
+        """Apply actions and simulate one control step."""
+
+    @abstractmethod
+    def proprioception(self) -> Float[Tensor, "envs features"]:
+        """Return what the policy feels of its own body."""
+
+    @abstractmethod
+    def motion(self) -> tuple[Float[Tensor, "envs 4"], Float[Tensor, "envs 3"]]:
+        """Return poses (x, y, z, yaw) in the world and velocities (vx, vy, wz) in the yaw frame."""
+
+    @abstractmethod
+    def fallen(self) -> Bool[Tensor, "envs"]:
+        """Tell which robots have fallen: nothing they do can save the episode."""
+
+    @abstractmethod
+    def reward(self, r_v: Float[Tensor, "envs"], failed: Bool[Tensor, "envs"]) -> Tensor:
+        """Return the reward of the step just taken, from r_v and the robot's own terms."""
+
+    @abstractmethod
+    def drawing(self) -> Float[np.ndarray, "envs features"]:
+        """Return what a figure or a video needs to draw each robot; the robot says what that is."""
+
+    def rebuild(self) -> None:
+        """Rebuild the physics so that nothing of the past remains in it."""
+
+    # rsl_rl's VecEnv --------------------------------------------------------------------------
+
+    @plain_tensors
+    def get_observations(self) -> TensorDict:
+        """Return the observation groups at the robots' present state."""
+        patch = self.patches()
+        policy = torch.cat((self.proprioception(), self.command, self.scan(patch)), dim=-1)
+        groups = {
+            "policy": policy,
+            "patch": patch,
+            "command": self.command.clone(),
+            "tracking": self.tracking.clone(),
+        }
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+
+    @plain_tensors
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """Take one control step; in training, ended episodes begin anew at once."""
+        self.advance(actions)
+        self.episode_length_buf += 1
+        pose, velocity = self.motion()
+        fell = self.fallen()
+        failed = fell | self._stuck(pose)
+        r_v = tracking_reward(velocity[:, :2], self.command[:, :2]) * ~failed
+        reward = self.reward(r_v, failed)
+        self.return_r_v += r_v
+        truncated = (self.episode_length_buf >= self.max_episode_length) | self._outside(pose)
+        done = failed | truncated
+        self.tracking = torch.stack((r_v, failed.float(), done.float()), dim=-1)
+        extras = {"time_outs": (truncated & ~failed).float(), "fell": fell}
+        if self.config.train:
+            ids = done.nonzero().flatten()
+            if len(ids):
+                self._promote(ids, failed)
+                self.reset(ids)
+            self._steer()
+        return self.get_observations(), reward, done.long(), extras
+
+    # Episodes ---------------------------------------------------------------------------------
+
+    def reseed(self, seed: int) -> None:
+        """Start the random stream of episodes anew: what follows depends on `seed` alone."""
+        self.random = torch.Generator(device="cpu").manual_seed(seed)
+
+    @plain_tensors
+    def reset_all(self) -> None:
+        """Begin a new episode for every robot on a rebuilt simulation."""
+        self.rebuild()
+        self.tracking.zero_()
+        self.reset(torch.arange(self.num_envs))
+
+    @plain_tensors
+    def reset(self, ids: Int[Tensor, "n"]) -> None:
+        """Begin new training episodes for `ids`: draw a pose, a heading and a speed."""
+        n = len(ids)
+        self.column[ids] = (self.column[ids] + 1) % self.num_columns
+        poses = self._draw_poses(ids)
+        low, high = self.config.speed
+        speed = low + (high - low) * self._uniform(n)
+        self.turning[ids] = self._uniform(n) < self.config.turn_share
+        self.start(ids, poses, speed)
+
+    @plain_tensors
+    def start(self, ids: Tensor, poses: Float[Tensor, "n 3"], speed: Tensor | float) -> None:
+        """Begin episodes at the given poses and forward speed, without drawing anything."""
+        self.place(ids, poses)
+        self.episode_length_buf[ids] = 0
+        self.return_r_v[ids] = 0.0
+        self.stuck_steps[ids] = 0
+        self.stuck_from[ids] = poses[:, :2]
+        self.anchor[ids] = poses[:, :2]
+        self.target_yaw[ids] = poses[:, 2]
+        self.command[ids] = 0.0
+        self.command[ids, 0] = speed
+
+    def patches(self) -> Float[Tensor, "envs points"]:
+        """Return the height patch H_xy under every robot, looking along its yaw."""
+        pose, _ = self.motion()
+        return sample_patches(
+            self.heights,
+            pose[:, [0, 1, 3]],
+            self.grid,
+            resolution=self.resolution,
+            origin=self.origin,
+        )
+
+    def scan(self, patch: Float[Tensor, "envs points"]) -> Tensor:
+        """Return the part of the patch that the policy sees; all of it by default."""
+        return patch
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what training must store to continue: the curriculum and the random stream."""
+        return {
+            "row": self.row.clone(),
+            "column": self.column.clone(),
+            "random": self.random.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take over a stored curriculum and random stream; call `reset_all` afterwards."""
+        self.row, self.column = state["row"].clone(), state["column"].clone()
+        self.random.set_state(state["random"])
+
+    def _uniform(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.random).to(self.device)
+
+    def _draw_poses(self, ids: Tensor) -> Float[Tensor, "n 3"]:
+        """Draw poses: across the tile from one of its ends, or anywhere the ground is level."""
+        n, tries = len(ids), 8
+        corner = self.tile_corner(ids)
+        length, width = self.tile_size
+        backwards = self._uniform(n) < 0.3
+        x = torch.where(backwards, length - 0.75, torch.full((n,), 0.75))
+        y = width * (0.2 + 0.6 * self._uniform(n))
+        yaw = torch.where(backwards, torch.full((n,), math.pi), torch.zeros(n))
+        across = torch.stack((corner[:, 0] + x, corner[:, 1] + y, yaw), dim=-1)
+        inside = 0.1 + 0.8 * self._uniform(n, tries, 2)
+        eighths = torch.floor(self._uniform(n, tries) * 8)
+        anywhere = torch.cat(
+            (corner[:, None] + inside * self.tile_size, eighths[..., None] * (math.pi / 4)), dim=-1
+        )
+        patch = sample_patches(
+            self.heights, anywhere, self.grid, resolution=self.resolution, origin=self.origin
+        )
+        under = patch[..., self.grid.footprint_index]
+        best = (under.amax(-1) - under.amin(-1)).argmin(dim=1)
+        level = anywhere[torch.arange(n), best]
+        poses = torch.where((self._uniform(n) < self.config.traverse_share)[:, None], across, level)
+        poses[:, 2] += 0.15 * (2 * self._uniform(n) - 1)
+        return poses
+
+    def _steer(self) -> None:
+        """Command the turn rate that keeps each robot on its line, as on a route."""
+        pose, _ = self.motion()
+        turn = self.turning & (self._uniform(self.num_envs) < self.control_dt / 2.0)
+        if turn.any():
+            eighths = torch.floor(self._uniform(self.num_envs) * 5) - 2
+            self.target_yaw = torch.where(
+                turn, self.target_yaw + eighths * (math.pi / 4), self.target_yaw
+            )
+            self.anchor = torch.where(turn[:, None], pose[:, :2], self.anchor)
+        along = torch.stack((torch.cos(self.target_yaw), torch.sin(self.target_yaw)), dim=-1)
+        offset = pose[:, :2] - self.anchor
+        aside = along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]
+        wanted = self.target_yaw - torch.atan2(aside, torch.tensor(0.6))
+        self.command[:, 2] = turn_rate(wanted, pose[:, 3], self.config.max_turn_rate)
+
+    def _stuck(self, pose: Tensor) -> Bool[Tensor, "envs"]:
+        moved = (pose[:, :2] - self.stuck_from).norm(dim=-1) > self.config.stuck_progress
+        self.stuck_from = torch.where(moved[:, None], pose[:, :2], self.stuck_from)
+        self.stuck_steps = torch.where(moved, 0, self.stuck_steps + 1)
+        return self.stuck_steps * self.control_dt > self.config.stuck_seconds
+
+    def _outside(self, pose: Tensor) -> Bool[Tensor, "envs"]:
+        """Tell which robots have left their tile for its margin."""
+        local = pose[:, :2] - self.tile_corner(torch.arange(self.num_envs))
+        return ((local < 0.0) | (local > self.tile_size)).any(dim=-1)
+
+    def tile_corner(self, ids: Tensor) -> Float[Tensor, "n 2"]:
+        """Return the world position of the corner (0, 0) of each robot's present tile, m."""
+        return self.offsets[self.row[ids], self.column[ids]]
+
+    def _promote(self, ids: Tensor, failed: Tensor) -> None:
+        """Move robots along the difficulty rows by the tracking reward of the episode just ended.
+
+        A robot that masters the last row is sent to a random one of the harder half.
+        """
+        mean = self.return_r_v[ids] / self.episode_length_buf[ids].clamp(min=1)
+        up = (mean > self.config.promote_above) & ~failed[ids]
+        down = (mean < self.config.demote_below) | failed[ids]
+        row = self.row[ids] + up.long() - (down & ~up).long()
+        half = self.num_rows // 2
+        anywhere = half + torch.floor(self._uniform(len(ids)) * (self.num_rows - half)).long()
+        self.row[ids] = torch.where(row >= self.num_rows, anywhere, row.clamp(min=0))
+
+
+def turn_rate(wanted: Tensor, yaw: Tensor, limit: float, gain: float = 3.0) -> Tensor:
+    """Return the turn rate (rad/s) that closes the yaw error the shorter way, within `limit`."""
+    error = torch.remainder(wanted - yaw + math.pi, 2 * math.pi) - math.pi
+    return (gain * error).clamp(-limit, limit)

@@ -1,0 +1,507 @@
+"""Joint training: PPO for the policy, and its Feasibility-Net on the very same rollouts.
+
+Reads a robot, a terrain name and a `TrainConfig`; gives a `Specialist` folder and, on the way,
+tensorboard curves and checkpoints to resume from. No data is collected for the Feasibility-Net
+alone: labels come from the tracking rewards in rsl_rl's rollout storage.
+Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
+"""
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+# rsl_rl's logger imports GitPython, which otherwise refuses to load where git is not installed.
+os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from rsl_rl.algorithms import PPO
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils import reduce_gradients_in_buckets
+from torch import Tensor
+from tqdm import tqdm
+
+from fgtutor.errors import CheckpointError, ConfigError
+from fgtutor.feasibility import FeasibilityNet
+from fgtutor.robots import env_class
+from fgtutor.robots.base import LocomotionEnv
+from fgtutor.specialist import Specialist, save_specialist
+from fgtutor.storage import atomic_write, make_folder
+from fgtutor.symmetry import SymmetricMLPModel
+from fgtutor.terrain import SCALES, World, make_terrain
+
+QUANTILES = (0.5, 0.9, 0.95, 0.99)
+"""Quantiles of L_recon that a specialist stores, for calibrated taus."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Train one specialist together with its Feasibility-Net."""
+
+    robot: str = "toy"
+    """Which robot: toy or a1."""
+    terrain: str = "steps"
+    """Terrain to specialise in, or `general` for all of the robot's terrains."""
+    out: Path | None = None
+    """Run folder for checkpoints, curves and the specialist; default runs/ROBOT-TERRAIN."""
+    resume: bool = False
+    """Continue from the run folder's checkpoint."""
+    iterations: int = 220
+    """PPO iterations in all."""
+    num_envs: int = 128
+    """Robots simulated side by side."""
+    steps: int = 40
+    """Control steps per robot and iteration."""
+    seed: int = 1
+    """Seed of everything random."""
+    save_every: int = 25
+    """Iterations between checkpoints; each one also starts every episode anew."""
+    label_seconds: float = 1.0
+    """Window over which r_v is averaged into a label, s; 0 is the paper's instantaneous label."""
+    rows: int = 6
+    """Difficulty rows of the training world."""
+    columns: int = 24
+    """Terrain variants per row."""
+    planning_speed: float = 0.85
+    """Forward speed of the command that planning pairs with every patch, m/s."""
+    hidden: tuple[int, ...] = (128, 64)
+    """Hidden widths of actor and critic."""
+    gamma: float = 0.98
+    """Discount per control step; at 25 Hz, 0.98 looks two seconds ahead."""
+    learning_rate: float = 1e-3
+    """Initial PPO learning rate; adapted to the KL divergence."""
+    entropy: float = 0.003
+    """PPO entropy coefficient at the start; it falls to zero over the run."""
+    initial_std: float = 0.6
+    """Standard deviation of the action noise at the start."""
+    feasibility_learning_rate: float = 1e-3
+    """Adam learning rate of the Feasibility-Net; it falls to a tenth over the run."""
+    feasibility_batch: int = 512
+    """Patches per Feasibility-Net update."""
+    feasibility_epochs: int = 3
+    """Passes of the Feasibility-Net over each rollout."""
+    threads: int = 1
+    """Torch threads; two trainings side by side with one thread each beat one with two."""
+    device: str = "cpu"
+    """Where the networks live: cpu, or cuda:0."""
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "num_envs", "steps", "save_every", "rows", "columns", "threads"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not self.label_seconds >= 0:
+            raise ConfigError(f"label_seconds must be 0 or more, got {self.label_seconds}")
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return self.out or Path("runs") / f"{self.robot}-{self.terrain}"
+
+
+def feasibility_labels(
+    tracking: Float[Tensor, "time envs 3"], window: int
+) -> tuple[Float[Tensor, "time envs"], Bool[Tensor, "time envs"]]:
+    """Return the mean r_v over the next `window` steps, and where that mean is trustworthy.
+
+    `tracking[t]` holds (r_v, failed, ended) of the step that led to time t. A failure makes
+    the rest of its window zero; a time-out cuts it short; no label reaches into the next episode.
+    A label counts if at least half of its window was seen. `window` 0 means 1, the paper's label.
+    """
+    window = max(window, 1)
+    steps = tracking.shape[0]
+    total = torch.zeros_like(tracking[..., 0])
+    seen = torch.zeros_like(total)
+    running = torch.ones_like(total, dtype=torch.bool)
+    failed_before = torch.zeros_like(running)
+    for ahead in range(1, window + 1):
+        # Steps of a failed episode that never happened still count, as zeros.
+        seen += failed_before
+        if ahead >= steps:
+            continue
+        r_v, failed, ended = tracking[ahead:].unbind(-1)
+        now = running[:-ahead]
+        total[:-ahead] += r_v * now
+        seen[:-ahead] += now
+        failed_before[:-ahead] |= now & (failed > 0)
+        running[:-ahead] = now & (ended == 0)
+        running[-ahead:] = False
+    return total / seen.clamp(min=1), seen >= (window + 1) // 2
+
+
+class FeasibilityPPO(PPO):
+    """rsl_rl's PPO that also fits the Feasibility-Net to each rollout before it learns from it.
+
+    The two share data and nothing else: separate networks, optimisers and losses.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        label_steps: int,
+        feasibility_learning_rate: float,
+        feasibility_batch: int,
+        feasibility_epochs: int,
+        **kwargs: Any,
+    ) -> None:
+        """Add a Feasibility-Net sized by the `patch` group to what PPO builds."""
+        super().__init__(*args, **kwargs)
+        num_points = self.storage.observations["patch"].shape[-1]
+        self.feasibility = FeasibilityNet(num_points).to(self.device)
+        self.feasibility_optimizer = torch.optim.Adam(
+            self.feasibility.parameters(), lr=feasibility_learning_rate
+        )
+        self.label_steps = label_steps
+        self.feasibility_batch, self.feasibility_epochs = feasibility_batch, feasibility_epochs
+        self.metrics: dict[str, float] = {}
+
+    def update(self) -> dict[str, float]:
+        """Fit the Feasibility-Net, then update the policy (which empties the storage)."""
+        tracking = self.storage.observations["tracking"]
+        self.metrics = {
+            "reward": self.storage.rewards.mean().item(),
+            "r_v": tracking[..., 0].mean().item(),
+            "failed": tracking[..., 1].sum().item() / max(1.0, tracking[..., 2].sum().item()),
+        }
+        self.metrics |= self.fit_feasibility()
+        self.metrics |= super().update()
+        return self.metrics
+
+    def fit_feasibility(self) -> dict[str, float]:
+        """Fit the net to the rollout's labelled patches; return the mean of each loss part."""
+        observations = self.storage.observations
+        label, valid = feasibility_labels(observations["tracking"], self.label_steps)
+        patch, command = observations["patch"][valid], observations["command"][valid]
+        label = label[valid]
+        sums: dict[str, float] = {}
+        batches = [
+            batch
+            for _ in range(self.feasibility_epochs)
+            for batch in torch.randperm(len(label), device=label.device).split(
+                self.feasibility_batch
+            )
+        ]
+        for batch in batches:
+            loss, parts = self.feasibility.loss(patch[batch], command[batch], label[batch])
+            self.feasibility_optimizer.zero_grad()
+            loss.backward()
+            if self.is_multi_gpu:
+                reduce_gradients_in_buckets(
+                    self.feasibility.parameters(), self.gpu_world_size, self.grad_reduce_bucket_mb
+                )
+            self.feasibility_optimizer.step()
+            for name, value in parts.items():
+                sums[name] = sums.get(name, 0.0) + value.item() / len(batches)
+        with torch.no_grad():
+            reconstruction = self.feasibility.reconstruction(patch[: 8 * self.feasibility_batch])
+        levels = torch.tensor(QUANTILES, device=reconstruction.device)
+        quantiles = torch.quantile(reconstruction, levels).tolist()
+        losses = {f"feasibility_{name}": value for name, value in sums.items()}
+        return losses | {f"L_recon_{q}": v for q, v in zip(QUANTILES, quantiles, strict=True)}
+
+    def broadcast_parameters(self) -> None:
+        """Copy all networks from the first process to the others."""
+        super().broadcast_parameters()
+        for tensor in self.feasibility.state_dict().values():
+            torch.distributed.broadcast(tensor, src=0)
+
+    def save(self) -> dict:
+        """Return the state of all networks and optimisers."""
+        return super().save() | {
+            "feasibility_state_dict": self.feasibility.state_dict(),
+            "feasibility_optimizer_state_dict": self.feasibility_optimizer.state_dict(),
+        }
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
+        """Take over the state that `save` returned."""
+        self.feasibility.load_state_dict(loaded_dict["feasibility_state_dict"], strict=strict)
+        self.feasibility_optimizer.load_state_dict(loaded_dict["feasibility_optimizer_state_dict"])
+        return super().load(loaded_dict, load_cfg, strict)
+
+
+class Trainer:
+    """One training run: environment, runner, checkpoints, curves."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        """Build the world, the robots and the learner; nothing is simulated yet."""
+        self.config = config
+        torch.set_num_threads(config.threads)
+        torch.manual_seed(config.seed)
+        self.env = make_training_env(config)
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.runner = OnPolicyRunner(
+                self.env, runner_config(config, self.env), log_dir=None, device=config.device
+            )
+        self.algorithm: FeasibilityPPO = self.runner.alg  # type: ignore[assignment]
+        self.iteration = 0
+        self.seconds = 0.0
+        self.history: list[dict[str, float]] = []
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where this run's checkpoint lies."""
+        return self.config.folder / "checkpoint.pt"
+
+    def iterate(self) -> dict[str, float]:
+        """Collect one rollout, learn from it, and return this iteration's numbers."""
+        began, done = time.monotonic(), self.iteration / self.config.iterations
+        self.algorithm.entropy_coef = self.config.entropy * max(0.0, 1 - 1.25 * done)
+        for group in self.algorithm.feasibility_optimizer.param_groups:
+            group["lr"] = self.config.feasibility_learning_rate * 0.1**done
+        self.runner.learn(1)
+        self.iteration += 1
+        self.seconds += time.monotonic() - began
+        row = {
+            "iteration": self.iteration,
+            "samples": self.iteration * self.env.num_envs * self.config.steps,
+            "seconds": self.seconds,
+            "row": self.env.row.float().mean().item(),
+            "std": self.algorithm.get_policy().output_std.mean().item(),
+            **self.algorithm.metrics,
+        }
+        self.history.append(row)
+        return row
+
+    def save(self) -> None:
+        """Write the checkpoint atomically, and begin all episodes anew.
+
+        Physics engines keep caches that no checkpoint can hold. So a checkpoint is a point where
+        the physics is rebuilt, in the run that goes on as in the run that resumes: both continue
+        from the same state, bit for bit.
+        """
+        state = {
+            "config": json.dumps(comparable(self.config)),
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "history": json.dumps(self.history),
+            "algorithm": self.algorithm.save(),
+            "env": self.env.state_dict(),
+            "torch_random": torch.get_rng_state(),
+        }
+        # Through memory: torch's own writer reports a full disk as something else than an OSError.
+        buffer = io.BytesIO()
+        torch.save(state, buffer)
+        with atomic_write(self.checkpoint) as temporary:
+            temporary.write_bytes(buffer.getvalue())
+        self.env.reset_all()
+
+    def resume(self) -> None:
+        """Continue from the run folder's checkpoint.
+
+        Raises `CheckpointError` if there is none, it cannot be read, or it is of another run.
+        """
+        path = self.checkpoint
+        if not path.exists():
+            raise CheckpointError(f"no checkpoint at {path}: start without --resume")
+        try:
+            state = torch.load(path, weights_only=True, map_location=self.config.device)
+            stored, mine = json.loads(state["config"]), comparable(self.config)
+        except Exception as error:
+            raise CheckpointError(
+                f"{path} is not a readable checkpoint ({type(error).__name__}): delete the folder "
+                "and train anew"
+            ) from error
+        changed = sorted(k for k in mine if stored.get(k) != mine[k])
+        if changed:
+            what = ", ".join(f"{k} was {stored.get(k)!r}, now {mine[k]!r}" for k in changed)
+            raise CheckpointError(
+                f"{path} belongs to another run: {what}. Use the same settings, or another --out"
+            )
+        self.algorithm.load(state["algorithm"])
+        self.env.load_state_dict(state["env"])
+        self.env.reset_all()
+        self.iteration, self.seconds = state["iteration"], state["seconds"]
+        self.history = json.loads(state["history"])
+        torch.set_rng_state(state["torch_random"].cpu())
+
+    def specialist(self) -> Specialist:
+        """Return what has been learned so far as a `Specialist`."""
+        config = self.config
+        recent = self.history[-10:]
+        every = max(1, len(self.history) // 100)
+        return Specialist(
+            name=config.terrain,
+            robot=config.robot,
+            policy=self.algorithm.get_policy(),
+            feasibility=self.algorithm.feasibility,
+            grid=self.env.grid,
+            command=(config.planning_speed, 0.0, 0.0),
+            label_seconds=config.label_seconds,
+            quantiles={
+                str(q): sum(row[f"L_recon_{q}"] for row in recent) / len(recent) for q in QUANTILES
+            },
+            provenance={
+                "terrain": config.terrain,
+                "samples": self.iteration * self.env.num_envs * config.steps,
+                "seed": config.seed,
+                "seconds": round(self.seconds, 1),
+                "config": comparable(config),
+                "versions": {p: version(p) for p in ("torch", "rsl-rl-lib", "pymunk", "mujoco")},
+                "curve": self.history[::every],
+            },
+        )
+
+
+def comparable(config: TrainConfig) -> dict[str, Any]:
+    """Return the settings that must not change between a run and its continuation."""
+    values = dataclasses.asdict(config)
+    for name in ("out", "resume", "threads", "device"):
+        del values[name]
+    values["hidden"] = list(values["hidden"])
+    return values
+
+
+def training_world(config: TrainConfig) -> World:
+    """Lay out rows of rising difficulty, each with its own terrain variants.
+
+    `general` takes the robot's specialties in turn, column by column. Seeds are even here, and odd
+    wherever terrain is evaluated, so nothing is ever evaluated on terrain trained on.
+    """
+    names = SCALES[config.robot].mixed if config.terrain == "general" else (config.terrain,)
+    levels = np.linspace(0.1, 1.0, config.rows) if config.rows > 1 else np.ones(1)
+    return World(
+        [
+            [
+                make_terrain(
+                    names[column % len(names)],
+                    robot=config.robot,
+                    difficulty=float(level),
+                    seed=2 * (config.seed * 10_000 + row * 100 + column),
+                )
+                for column in range(config.columns)
+            ]
+            for row, level in enumerate(levels)
+        ]
+    )
+
+
+def make_training_env(config: TrainConfig) -> LocomotionEnv:
+    """Build the robots on their training world."""
+    make = env_class(config.robot)
+    return make(
+        training_world(config),
+        config.num_envs,
+        seed=config.seed,
+        device=config.device,
+    )
+
+
+def runner_config(config: TrainConfig, env: LocomotionEnv) -> dict[str, Any]:
+    """Return rsl_rl's configuration; a fresh dict each time, since rsl_rl consumes it."""
+    network = {"class_name": "MLPModel", "hidden_dims": list(config.hidden), "activation": "elu"}
+    noise = {
+        "class_name": "GaussianDistribution",
+        "init_std": config.initial_std,
+        "std_type": "log",
+        "std_range": (0.05, 2.0),
+    }
+    actor = network | {"distribution_cfg": noise}
+    if env.mirror:
+        actor |= {"class_name": SymmetricMLPModel, "mirror": env.mirror}
+    return {
+        "num_steps_per_env": config.steps,
+        "save_interval": config.iterations + 1,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": actor,
+        "critic": dict(network),
+        "algorithm": {
+            "class_name": FeasibilityPPO,
+            "num_learning_epochs": 4,
+            "num_mini_batches": 4,
+            "clip_param": 0.2,
+            "gamma": config.gamma,
+            "lam": 0.95,
+            "value_loss_coef": 0.5,
+            "entropy_coef": config.entropy,
+            "learning_rate": config.learning_rate,
+            "desired_kl": 0.012,
+            "label_steps": round(config.label_seconds / env.control_dt),
+            "feasibility_learning_rate": config.feasibility_learning_rate,
+            "feasibility_batch": config.feasibility_batch,
+            "feasibility_epochs": config.feasibility_epochs,
+        },
+    }
+
+
+def train(
+    config: TrainConfig, *, on_iteration: Callable[[dict[str, float]], None] | None = None
+) -> Specialist:
+    """Train one specialist; write its folder to `<run>/specialist` and return it.
+
+    Shows a progress bar with the time left. Ctrl-C saves a checkpoint and returns what has been
+    learned; `config.resume` continues. `on_iteration` gets each iteration's numbers (the notebooks
+    draw them).
+    """
+    trainer = Trainer(config)
+    if config.resume:
+        trainer.resume()
+    from torch.utils.tensorboard import SummaryWriter
+
+    make_folder(config.folder)
+    with (
+        SummaryWriter(str(config.folder / "tensorboard")) as writer,
+        tqdm(total=config.iterations, initial=trainer.iteration, unit="it") as bar,
+        stop_on_interrupt() as stopped,
+    ):
+        bar.set_description(f"{config.robot} {config.terrain}")
+        while trainer.iteration < config.iterations:
+            row = trainer.iterate()
+            for name, value in row.items():
+                writer.add_scalar(name, value, trainer.iteration)
+            bar.update()
+            bar.set_postfix(
+                r_v=f"{row['r_v']:.2f}", row=f"{row['row']:.1f}", std=f"{row['std']:.2f}"
+            )
+            if on_iteration:
+                on_iteration(row)
+            if trainer.iteration % config.save_every == 0:
+                trainer.save()
+            if stopped():
+                break
+        if trainer.iteration % config.save_every:
+            trainer.save()
+    specialist = trainer.specialist()
+    save_specialist(specialist, config.folder / "specialist")
+    return specialist
+
+
+@contextlib.contextmanager
+def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Turn the first Ctrl-C into a request to stop after this iteration; the second one interrupts.
+
+    Outside the main thread, where signals cannot be handled, Ctrl-C keeps its usual meaning.
+    """
+    asked = False
+
+    def ask(*_: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+
+    try:
+        previous = signal.signal(signal.SIGINT, ask)
+    except ValueError:
+        yield lambda: False
+        return
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def run(config: TrainConfig) -> int:
+    """Train from the command line and say where the result lies."""
+    specialist = train(config)
+    samples = specialist.provenance["samples"]
+    print(f"{config.robot} {config.terrain}: {samples:,} samples -> {config.folder / 'specialist'}")
+    return 0

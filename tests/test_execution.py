@@ -1,0 +1,136 @@
+import numpy as np
+import pytest
+import torch
+
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError
+from fgtutor.execution import FollowConfig, execute, execute_batch
+from fgtutor.planning import plan
+from fgtutor.terrain import Terrain, make_terrain
+
+
+def straight(elevation, start, goal, policy=0):
+    """The route that a tensor of ones gives, all of it by one policy."""
+    fused = np.ones((*elevation.shape, 8))
+    policies = np.full(fused.shape, policy)
+    return plan(
+        fused, policies, grid=elevation, start=start, goal=goal, cost="length", backend="scipy",
+        unknown="fill",
+    )  # fmt: skip
+
+
+def flat(shape=(60, 40)):
+    return ElevationMap(np.zeros(shape))
+
+
+def task(start, goal, heights=None):
+    elevation = ElevationMap(heights) if heights is not None else flat()
+    return straight(elevation, start, goal), Terrain.from_elevation(elevation, start, goal)
+
+
+def test_a_toy_reaches_the_end_of_a_straight_route(make_rolling):
+    route, terrain = task((1.0, 2.0), (4.0, 2.0))
+    episode = execute(route, terrain, {"roll": make_rolling()})
+    assert episode.success and episode.reason == "reached"
+    assert np.hypot(*(episode.poses[-1, :2] - route.xy[-1])) <= 0.35
+    assert episode.length == pytest.approx(3.0 - 0.35, abs=0.15)
+    # 2.65 m at 0.85 m/s, and a moment to get going.
+    assert episode.seconds == pytest.approx(3.1, abs=0.6)
+    assert episode.body is not None and len(episode.body) == len(episode.poses)
+
+
+@pytest.mark.parametrize("goal", [(4.0, 3.5), (1.0, 3.6), (4.5, 0.6)])
+def test_it_follows_bends(make_rolling, goal):
+    route, terrain = task((1.5, 2.0), goal)
+    episode = execute(route, terrain, {"roll": make_rolling()})
+    assert episode.success
+    away = np.hypot(*(episode.poses[:, None, :2] - route.xy[None]).transpose(2, 0, 1)).min(axis=1)
+    assert away.max() < 0.45, "it stays near the route"
+
+
+def test_a_ledge_is_a_time_out_and_a_gap_is_a_fall(make_rolling):
+    ledge, gap = np.zeros((60, 40)), np.zeros((60, 40))
+    ledge[30:], gap[30:34] = 0.2, -1.0
+    tasks = [task((1.0, 2.0), (4.5, 2.0), heights) for heights in (ledge, gap)]
+    episodes = execute_batch(*zip(*tasks, strict=True), {"roll": make_rolling()}, seeds=[0, 1])
+    assert [episode.reason for episode in episodes] == ["timeout", "fell"]
+    limit = 3 * tasks[0][0].length / 0.85 + 5
+    assert episodes[0].seconds == pytest.approx(limit, abs=0.1)
+    assert episodes[1].seconds < 5
+
+
+def test_a_batch_gives_what_single_trials_give(make_rolling):
+    terrains = [make_terrain("rubble", difficulty=0.3, seed=seed) for seed in (1, 3, 5)]
+    routes = [straight(t.elevation, t.start, (6.0, t.start[1])) for t in terrains]
+    zoo = {"roll": make_rolling()}
+    together = execute_batch(routes, terrains, zoo, seeds=[7, 8, 9])
+    for index, terrain in enumerate(terrains):
+        alone = execute(routes[index], terrain, zoo, seed=7 + index)
+        assert alone.reason == together[index].reason
+        # Lanes lie at other heights in pymunk's space: equal up to what a float holds there.
+        assert alone.poses[:20] == pytest.approx(together[index].poses[:20], abs=1e-3)
+
+
+def test_the_policy_switches_where_the_route_says_and_holds_on_a_flicker(make_rolling):
+    elevation = flat()
+    fused = np.ones((60, 40, 8))
+    policies = np.zeros(fused.shape, dtype=int)
+    policies[30:] = 1
+    policies[20] = 1  # one cell: over before the hysteresis has made up its mind
+    route = plan(
+        fused, policies, grid=elevation, start=(1.0, 2.0), goal=(4.5, 2.0), cost="length",
+        backend="scipy",
+    )  # fmt: skip
+    assert route.switches == 3
+    terrain = Terrain.from_elevation(elevation, (1.0, 2.0), (4.5, 2.0))
+    zoo = {"a": make_rolling("steps"), "b": make_rolling("gaps")}
+    held = execute(route, terrain, zoo, config=FollowConfig(hold_steps=4))
+    assert held.success and held.switches == 1
+    at = held.poses[np.flatnonzero(np.diff(held.policies))[0], 0]
+    assert at == pytest.approx(3.1, abs=0.15)
+    assert execute(route, terrain, zoo, config=FollowConfig(hold_steps=1)).switches == 3
+
+
+def test_localisation_noise_misleads_the_follower_only(make_rolling):
+    route, terrain = task((1.0, 2.0), (4.0, 2.0))
+    zoo = {"roll": make_rolling()}
+    exact = execute(route, terrain, zoo)
+    lost = execute(route, terrain, zoo, config=FollowConfig(position_noise=0.1, drift=0.05))
+    assert lost.poses[0, :2] == pytest.approx(exact.poses[0, :2], abs=1e-3)
+    assert np.abs(lost.poses[40, 1] - 2.0) > np.abs(exact.poses[40, 1] - 2.0)
+
+
+def test_the_seed_alone_decides(make_rolling):
+    route, terrain = task((1.0, 2.0), (3.0, 2.0))
+    zoo = {"roll": make_rolling()}
+    first, again, other = (execute(route, terrain, zoo, seed=seed) for seed in (3, 3, 4))
+    assert np.array_equal(first.poses, again.poses)
+    assert not np.array_equal(first.poses[0], other.poses[0])
+
+
+def test_a_route_of_one_cell_is_reached_at_once(make_rolling):
+    route, terrain = task((2.0, 2.0), (2.0, 2.0))
+    episode = execute(route, terrain, {"roll": make_rolling()})
+    assert episode.success and len(episode.poses) == 1
+
+
+def test_no_routes_no_episodes(make_rolling):
+    assert execute_batch([], [], {"roll": make_rolling()}, seeds=[]) == []
+
+
+def test_what_cannot_be_driven_is_refused(make_rolling):
+    route, terrain = task((1.0, 2.0), (3.0, 2.0))
+    with pytest.raises(ConfigError, match="one route, terrain and seed"):
+        execute_batch([route], [terrain], {"roll": make_rolling()}, seeds=[])
+    with pytest.raises(ConfigError, match="policy number 2"):
+        execute(straight(flat(), (1, 2), (3, 2), policy=2), terrain, {"roll": make_rolling()})
+    with pytest.raises(ConfigError, match="one robot"):
+        execute(route, terrain, {})
+
+
+def test_execution_leaves_the_policy_as_it_was(make_rolling):
+    route, terrain = task((1.0, 2.0), (2.0, 2.0))
+    specialist = make_rolling()
+    before = {k: v.clone() for k, v in specialist.policy.state_dict().items()}
+    execute(route, terrain, {"roll": specialist})
+    assert all(torch.equal(v, before[k]) for k, v in specialist.policy.state_dict().items())

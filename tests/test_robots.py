@@ -1,0 +1,168 @@
+"""One contract for every robot: a third robot needs one line in ROBOTS and passes all of this."""
+
+import math
+
+import pytest
+import torch
+
+from fgtutor import patches
+from fgtutor.errors import ConfigError
+from fgtutor.patches import sample_patches
+from fgtutor.robots import ROBOTS, env_class
+from fgtutor.robots.base import EnvConfig, tracking_reward, turn_rate
+from fgtutor.terrain import World, make_terrain
+
+robots = pytest.mark.parametrize("robot", sorted(ROBOTS))
+
+
+def make_env(robot, *names, num_envs=4, seed=0, **config):
+    names = names or ("steps", "gaps")
+    tiles = [make_terrain(name, robot=robot, difficulty=0.6, seed=3) for name in names]
+    return env_class(robot)(World([tiles]), num_envs, config=EnvConfig(**config), seed=seed)
+
+
+def actions(env, steps, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return 0.5 * torch.randn(steps, env.num_envs, env.num_actions, generator=generator)
+
+
+def test_tracking_reward_by_hand():
+    # |(0.3, 0.4)| = 0.5, so r_v = exp(-0.5 / 0.25) = exp(-2).
+    velocity, command = (
+        torch.tensor([[0.3, 0.4], [1.0, 0.0]]),
+        torch.tensor([[0.0, 0.0], [1.0, 0.0]]),
+    )
+    assert tracking_reward(velocity, command).tolist() == pytest.approx([math.exp(-2), 1.0])
+
+
+def test_turn_rate_takes_the_shorter_way_within_the_limit():
+    wanted = torch.tensor([math.pi - 0.1, 0.2, 3.0])
+    yaw = torch.tensor([-math.pi + 0.1, 0.1, 0.0])
+    assert turn_rate(wanted, yaw, 1.5).tolist() == pytest.approx([-0.6, 0.3, 1.5], abs=1e-5)
+
+
+@robots
+def test_observation_groups_are_flat_and_finite(robot):
+    env = make_env(robot)
+    observations = env.get_observations()
+    assert set(observations.keys()) == {"policy", "patch", "command", "tracking"}
+    assert observations["patch"].shape == (4, env.grid.num_points)
+    assert observations["command"].shape == observations["tracking"].shape == (4, 3)
+    for action in actions(env, 5):
+        observations, reward, done, extras = env.step(action)
+        assert all(
+            torch.isfinite(group).all() and group.ndim == 2 for group in observations.values()
+        )
+        assert reward.shape == done.shape == extras["time_outs"].shape == (4,)
+
+
+@robots
+def test_the_same_seed_gives_the_same_rollout(robot):
+    first, second = make_env(robot, seed=5), make_env(robot, seed=5)
+    for action in actions(first, 12):
+        a, b = first.step(action), second.step(action)
+        assert torch.equal(a[0]["policy"], b[0]["policy"]) and torch.equal(a[1], b[1])
+    other = make_env(robot, seed=6)
+    assert not torch.equal(other.get_observations()["policy"], first.get_observations()["policy"])
+
+
+@robots
+def test_a_restored_environment_continues_as_the_original(robot):
+    original = make_env(robot, seed=1)
+    for action in actions(original, 6):
+        original.step(action)
+    state = original.state_dict()
+    original.reset_all()
+    restored = make_env(robot, seed=99)
+    restored.load_state_dict(state)
+    restored.reset_all()
+    for action in actions(original, 6, seed=1):
+        assert torch.equal(original.step(action)[0]["policy"], restored.step(action)[0]["policy"])
+
+
+@robots
+def test_placing_puts_robots_where_asked(robot):
+    env = make_env(robot, "flat", train=False)
+    poses = torch.tensor([[2.0, 2.0, 0.0], [3.0, 1.0, 1.0], [4.0, 2.5, -2.0], [5.0, 2.0, math.pi]])
+    poses[:, :2] += env.tile_corner(torch.arange(4))
+    env.start(torch.arange(4), poses, 0.5)
+    pose, velocity = env.motion()
+    assert torch.allclose(pose[:, [0, 1]], poses[:, :2], atol=1e-3)
+    turned = torch.remainder(pose[:, 3] - poses[:, 2] + math.pi, 2 * math.pi) - math.pi
+    assert turned.abs().max() < 1e-3
+    assert velocity.abs().max() < 1e-3
+    assert env.command[:, 0].tolist() == pytest.approx([0.5] * 4)
+
+
+@robots
+def test_a_robot_that_does_nothing_neither_falls_nor_leaves(robot):
+    env = make_env(robot, "flat", train=False)
+    poses = torch.tensor([[4.0, 2.0, 0.7]]).repeat(4, 1)
+    poses[:, :2] += env.tile_corner(torch.arange(4))
+    env.start(torch.arange(4), poses, 0.0)
+    for _ in range(round(2.0 / env.control_dt)):
+        *_, extras = env.step(torch.zeros(4, env.num_actions))
+        assert not extras["fell"].any()
+    moved = env.motion()[0][:, :2] - poses[:, :2]
+    assert moved.norm(dim=-1).max() < 0.2
+
+
+@robots
+def test_patches_are_those_of_the_planner(robot):
+    terrain = make_terrain("steps", robot=robot, difficulty=0.6, seed=3)
+    env = env_class(robot)(World([[terrain]]), 3, config=EnvConfig(train=False))
+    places = torch.tensor([[0.1, 0.1, 0.5], [2.0, 2.0, 0.0], [4.3, 3.9, 2.0]])
+    poses = places.clone()
+    poses[:, :2] += env.tile_corner(torch.arange(3))
+    env.start(torch.arange(3), poses, 0.5)
+    own = patches.prepare(terrain.elevation)
+    expected = sample_patches(
+        torch.tensor(own.heights), places, env.grid, resolution=own.resolution, origin=own.origin
+    )
+    assert torch.allclose(env.get_observations()["patch"], expected, atol=1e-3)
+
+
+@robots
+def test_waiting_ends_an_episode_as_a_failure_without_reward(robot):
+    env = make_env(robot, "flat", stuck_seconds=0.3, speed=(0.0, 0.0), turn_share=0.0)
+    failed = torch.zeros(4, dtype=torch.bool)
+    for _ in range(round(1.5 / env.control_dt)):
+        observations, _, done, extras = env.step(torch.zeros(4, env.num_actions))
+        r_v, fails, ends = observations["tracking"].unbind(-1)
+        failed |= fails.bool()
+        assert (r_v[fails > 0] == 0).all() and (ends[fails > 0] == 1).all()
+        assert (extras["time_outs"][fails > 0] == 0).all() and (done[fails > 0] == 1).all()
+    assert failed.all()
+
+
+@robots
+def test_leaving_the_tile_is_a_time_out_and_not_a_failure(robot):
+    env = make_env(robot, "flat", train=False)
+    poses = torch.tensor([[-0.05, 2.0, 0.0]]).repeat(4, 1)
+    poses[:, :2] += env.tile_corner(torch.arange(4))
+    env.start(torch.arange(4), poses, 0.0)
+    observations, _, done, extras = env.step(torch.zeros(4, env.num_actions))
+    assert done.all() and extras["time_outs"].all() and not observations["tracking"][:, 1].any()
+
+
+@robots
+def test_the_curriculum_follows_the_tracking_reward(robot):
+    tiles = [[make_terrain("flat", robot=robot, seed=2)] for _ in range(3)]
+    env = env_class(robot)(World(tiles), 4, config=EnvConfig())
+    env.row = torch.tensor([1, 1, 1, 2])
+    env.episode_length_buf[:] = 10
+    env.return_r_v = torch.tensor([9.0, 9.0, 4.0, 9.0])
+    failed = torch.tensor([False, True, False, False])
+    env._promote(torch.arange(4), failed)
+    # Good: up. Failed: down. Middling: stays. Good on the last row: anywhere in the harder half.
+    assert env.row[:3].tolist() == [2, 0, 1] and env.row[3] >= 1
+
+
+def test_an_unknown_robot_lists_the_known_ones():
+    with pytest.raises(ConfigError, match="toy"):
+        env_class("zebra")
+
+
+def test_an_environment_needs_a_robot():
+    with pytest.raises(ConfigError, match="num_envs"):
+        make_env("toy", num_envs=0)

@@ -1,0 +1,223 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from fgtutor.errors import CheckpointError, ConfigError, StorageError
+from fgtutor.specialist import load_specialist
+from fgtutor.training import TrainConfig, Trainer, feasibility_labels, train, training_world
+
+TINY = {
+    "num_envs": 4,
+    "steps": 8,
+    "rows": 2,
+    "columns": 2,
+    "label_seconds": 0.12,
+    "save_every": 2,
+    "iterations": 6,
+}
+
+
+def tracking(*steps):
+    """One robot's (r_v, failed, ended) per step."""
+    return torch.tensor(steps, dtype=torch.float32)[:, None]
+
+
+def test_labels_average_the_steps_ahead():
+    label, valid = feasibility_labels(
+        tracking((9, 0, 0), (0.2, 0, 0), (0.4, 0, 0), (0.9, 0, 0), (0.1, 0, 0)), 2
+    )
+    # At t = 0 the next two steps gave 0.2 and 0.4; at t = 3 one of two was seen, at t = 4 none.
+    assert label[:4, 0].tolist() == pytest.approx([0.3, 0.65, 0.5, 0.1])
+    assert valid[:, 0].tolist() == [True, True, True, True, False]
+
+
+def test_a_failure_makes_the_rest_of_its_window_zero_and_hides_the_next_episode():
+    label, valid = feasibility_labels(
+        tracking((9, 0, 0), (0.8, 0, 0), (0, 1, 1), (1, 0, 0), (1, 0, 0), (1, 0, 0)), 4
+    )
+    # From t = 0: 0.8, then the fall, then nothing: 0.8 / 4. From t = 1: 0. From t = 2 all is new.
+    assert label[:3, 0].tolist() == pytest.approx([0.2, 0.0, 1.0])
+    assert valid[:3].all()
+
+
+def test_a_failure_counts_even_if_the_rollout_ends_soon_after():
+    label, valid = feasibility_labels(tracking((9, 0, 0), (0.8, 0, 0), (0, 1, 1)), 10)
+    assert label[0, 0] == pytest.approx(0.08) and valid[0, 0]
+
+
+def test_a_time_out_cuts_the_window_without_zeros():
+    label, valid = feasibility_labels(
+        tracking((9, 0, 0), (0.6, 0, 0), (0.8, 0, 1), (0.1, 0, 0), (0.1, 0, 0)), 4
+    )
+    assert label[0, 0] == pytest.approx(0.7) and valid[0, 0]
+    # One step of four was left before the time-out: too little to count.
+    assert label[1, 0] == pytest.approx(0.8) and not valid[1, 0]
+
+
+@pytest.mark.parametrize("window", [0, 1])
+def test_the_instantaneous_label_is_the_next_step(window):
+    label, valid = feasibility_labels(tracking((9, 0, 0), (0.3, 0, 0), (0.5, 0, 0)), window)
+    assert label[:2, 0].tolist() == pytest.approx([0.3, 0.5])
+    assert valid[:, 0].tolist() == [True, True, False]
+
+
+def test_labels_agree_with_a_naive_loop():
+    generator = torch.Generator().manual_seed(0)
+    steps, envs, window = 40, 20, 7
+    ended = torch.rand(steps, envs, generator=generator) < 0.08
+    failed = ended & (torch.rand(steps, envs, generator=generator) < 0.5)
+    r_v = torch.rand(steps, envs, generator=generator) * ~failed
+    label, valid = feasibility_labels(torch.stack((r_v, failed, ended), -1).float(), window)
+    for t in range(steps):
+        for env in range(envs):
+            seen = []
+            for k in range(t + 1, min(t + window, steps - 1) + 1):
+                seen.append(r_v[k, env].item())
+                if failed[k, env]:
+                    seen += [0.0] * (window - len(seen))
+                if ended[k, env]:
+                    break
+            assert valid[t, env] == (len(seen) >= 4)
+            if seen:
+                assert label[t, env] == pytest.approx(sum(seen) / len(seen), abs=1e-6)
+
+
+def run_in_subprocess(folder, resume, until=None):
+    """Train in a process of its own; kill it (SIGKILL) once the checkpoint holds `until`."""
+    settings = TINY | {"terrain": "steps", "resume": resume}
+    code = (
+        "import sys, json, pathlib; from fgtutor.training import TrainConfig, train\n"
+        f"train(TrainConfig(out=pathlib.Path({str(folder)!r}), **{settings!r}))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", code], stderr=subprocess.DEVNULL
+    )
+    checkpoint = folder / "checkpoint.pt"
+    while until and process.poll() is None:
+        if checkpoint.exists() and torch.load(checkpoint)["iteration"] >= until:
+            process.send_signal(signal.SIGKILL)
+        time.sleep(0.01)
+    return process.wait()
+
+
+@pytest.mark.slow
+def test_kill_and_resume_equals_an_unbroken_run_bit_for_bit(tmp_path):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    assert run_in_subprocess(whole, resume=False) == 0
+    assert run_in_subprocess(broken, resume=False, until=2) == -signal.SIGKILL
+    assert not (broken / "specialist").exists()
+    assert run_in_subprocess(broken, resume=True) == 0
+    for name in ("policy.safetensors", "feasibility.safetensors"):
+        assert (whole / "specialist" / name).read_bytes() == (
+            broken / "specialist" / name
+        ).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    rows = []
+    config = TrainConfig(out=folder, **TINY)
+    return config, train(config, on_iteration=rows.append), rows
+
+
+def test_training_writes_a_specialist_that_loads(trained):
+    config, specialist, rows = trained
+    loaded = load_specialist(config.folder / "specialist")
+    assert loaded.name == "steps" and loaded.robot == "toy"
+    assert loaded.provenance["samples"] == 6 * 4 * 8
+    assert [row["iteration"] for row in rows] == [1, 2, 3, 4, 5, 6]
+    for name, value in specialist.feasibility.state_dict().items():
+        assert torch.equal(value, loaded.feasibility.state_dict()[name])
+
+
+def test_training_moves_both_networks(trained):
+    config, specialist, _ = trained
+    fresh = Trainer(config)
+    before = fresh.algorithm.get_policy().state_dict()
+    assert any(not torch.equal(v, before[k]) for k, v in specialist.policy.state_dict().items())
+    before = fresh.algorithm.feasibility.state_dict()
+    after = specialist.feasibility.state_dict()
+    assert all(not torch.equal(after[k], before[k]) for k in after)
+
+
+def test_resuming_a_finished_run_changes_nothing(trained):
+    config, specialist, _ = trained
+    again = train(TrainConfig(out=config.folder, resume=True, **TINY))
+    for name, value in specialist.policy.state_dict().items():
+        assert torch.equal(value, again.policy.state_dict()[name])
+
+
+def test_the_ppo_loss_never_reaches_the_feasibility_net(trained):
+    config, _, _ = trained
+    trainer = Trainer(config)
+    ppo = {id(p) for group in trainer.algorithm.optimizer.param_groups for p in group["params"]}
+    assert ppo.isdisjoint(id(p) for p in trainer.algorithm.feasibility.parameters())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"terrain": "gaps"}, "terrain was 'steps', now 'gaps'"), ({"seed": 5}, "seed was 1, now 5")],
+)
+def test_a_checkpoint_of_another_run_is_refused(trained, change, message):
+    config, _, _ = trained
+    with pytest.raises(CheckpointError, match=message):
+        train(TrainConfig(out=config.folder, resume=True, **TINY | change))
+
+
+def test_a_checkpoint_of_another_robot_is_refused(trained, tmp_path):
+    config, _, _ = trained
+    state = torch.load(config.folder / "checkpoint.pt", weights_only=True)
+    state["config"] = json.dumps(json.loads(state["config"]) | {"robot": "a1"})
+    torch.save(state, tmp_path / "checkpoint.pt")
+    with pytest.raises(CheckpointError, match="robot was 'a1', now 'toy'"):
+        train(TrainConfig(out=tmp_path, resume=True, **TINY))
+
+
+@pytest.mark.parametrize("damage", ["truncate", "garbage", "missing"])
+def test_an_unreadable_checkpoint_says_what_to_do(trained, tmp_path, damage):
+    config, _, _ = trained
+    payload = (config.folder / "checkpoint.pt").read_bytes()
+    if damage != "missing":
+        (tmp_path / "checkpoint.pt").write_bytes(
+            payload[: len(payload) // 2] if damage == "truncate" else b"no checkpoint"
+        )
+    with pytest.raises(CheckpointError, match=r"checkpoint\.pt|--resume"):
+        train(TrainConfig(out=tmp_path, resume=True, **TINY))
+
+
+def test_a_run_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StorageError, match="file"):
+        train(TrainConfig(out=tmp_path / "file" / "run", **TINY))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows delivers Ctrl-C to the whole console")
+def test_ctrl_c_saves_and_returns_what_was_learned(tmp_path):
+    def interrupt(row):
+        if row["iteration"] == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    specialist = train(TrainConfig(out=tmp_path, **TINY), on_iteration=interrupt)
+    assert specialist.provenance["samples"] == 3 * 4 * 8
+    assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["iteration"] == 3
+    resumed = train(TrainConfig(out=tmp_path, resume=True, **TINY))
+    assert resumed.provenance["samples"] == 6 * 4 * 8
+
+
+@pytest.mark.parametrize("name", ["iterations", "num_envs", "steps", "save_every", "rows"])
+def test_a_setting_below_one_is_refused(name):
+    with pytest.raises(ConfigError, match=name):
+        TrainConfig(**{name: 0})
+
+
+def test_the_generalist_trains_on_every_specialty():
+    world = training_world(TrainConfig(terrain="general", rows=1, columns=8))
+    assert [tile.name for tile in world.tiles[0]] == ["steps", "gaps", "slopes", "rubble"] * 2
+    assert all(tile.seed % 2 == 0 for tile in world.tiles[0])
