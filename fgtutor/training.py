@@ -56,7 +56,7 @@ class TrainConfig:
     """Run folder for checkpoints, curves and the specialist; default runs/ROBOT-TERRAIN."""
     resume: bool = False
     """Continue from the run folder's checkpoint."""
-    iterations: int = 220
+    iterations: int = 200
     """PPO iterations in all."""
     num_envs: int = 128
     """Robots simulated side by side."""
@@ -84,12 +84,12 @@ class TrainConfig:
     """PPO entropy coefficient at the start; it falls to zero over the run."""
     initial_std: float = 0.6
     """Standard deviation of the action noise at the start."""
-    feasibility_learning_rate: float = 1e-3
-    """Adam learning rate of the Feasibility-Net; it falls to a tenth over the run."""
+    feasibility_learning_rate: float = 2e-3
+    """Adam learning rate of the Feasibility-Net; it falls to a twentieth over the run."""
     feasibility_batch: int = 512
     """Patches per Feasibility-Net update."""
-    feasibility_epochs: int = 3
-    """Passes of the Feasibility-Net over each rollout."""
+    feasibility_updates: int = 24
+    """Feasibility-Net updates per iteration, on patches of all rollouts since the checkpoint."""
     threads: int = 1
     """Torch threads; two trainings side by side with one thread each beat one with two."""
     device: str = "cpu"
@@ -150,7 +150,7 @@ class FeasibilityPPO(PPO):
         label_steps: int,
         feasibility_learning_rate: float,
         feasibility_batch: int,
-        feasibility_epochs: int,
+        feasibility_updates: int,
         **kwargs: Any,
     ) -> None:
         """Add a Feasibility-Net sized by the `patch` group to what PPO builds."""
@@ -161,8 +161,9 @@ class FeasibilityPPO(PPO):
             self.feasibility.parameters(), lr=feasibility_learning_rate
         )
         self.label_steps = label_steps
-        self.feasibility_batch, self.feasibility_epochs = feasibility_batch, feasibility_epochs
+        self.feasibility_batch, self.feasibility_updates = feasibility_batch, feasibility_updates
         self.metrics: dict[str, float] = {}
+        self.memory: list[tuple[Tensor, Tensor, Tensor]] = []
 
     def update(self) -> dict[str, float]:
         """Fit the Feasibility-Net, then update the policy (which empties the storage)."""
@@ -177,19 +178,20 @@ class FeasibilityPPO(PPO):
         return self.metrics
 
     def fit_feasibility(self) -> dict[str, float]:
-        """Fit the net to the rollout's labelled patches; return the mean of each loss part."""
+        """Fit the net to the labelled patches at hand; return the mean of each loss part.
+
+        These are the rollouts since the last checkpoint: neighbours in one rollout are too alike to
+        learn from one rollout at a time, and labels of long ago describe another policy.
+        """
         observations = self.storage.observations
         label, valid = feasibility_labels(observations["tracking"], self.label_steps)
-        patch, command = observations["patch"][valid], observations["command"][valid]
-        label = label[valid]
+        self.memory.append(
+            (observations["patch"][valid], observations["command"][valid], label[valid])
+        )
+        patch, command, label = (torch.cat(parts) for parts in zip(*self.memory, strict=True))
         sums: dict[str, float] = {}
-        batches = [
-            batch
-            for _ in range(self.feasibility_epochs)
-            for batch in torch.randperm(len(label), device=label.device).split(
-                self.feasibility_batch
-            )
-        ]
+        shape = (self.feasibility_updates, self.feasibility_batch)
+        batches = torch.randint(len(label), shape, device=label.device)
         for batch in batches:
             loss, parts = self.feasibility.loss(patch[batch], command[batch], label[batch])
             self.feasibility_optimizer.zero_grad()
@@ -202,7 +204,8 @@ class FeasibilityPPO(PPO):
             for name, value in parts.items():
                 sums[name] = sums.get(name, 0.0) + value.item() / len(batches)
         with torch.no_grad():
-            reconstruction = self.feasibility.reconstruction(patch[: 8 * self.feasibility_batch])
+            sample = patch[batches[:8].flatten()]
+            reconstruction = self.feasibility.reconstruction(sample)
         levels = torch.tensor(QUANTILES, device=reconstruction.device)
         quantiles = torch.quantile(reconstruction, levels).tolist()
         losses = {f"feasibility_{name}": value for name, value in sums.items()}
@@ -237,6 +240,12 @@ class Trainer:
         torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         self.env = make_training_env(config)
+        half_window = (round(config.label_seconds / self.env.control_dt) + 1) // 2
+        if config.steps <= half_window:
+            raise ConfigError(
+                f"rollouts of {config.steps} steps never see half of a {config.label_seconds:g} s "
+                f"label: set steps to {half_window + 1} or more, or label_seconds lower"
+            )
         with contextlib.redirect_stdout(io.StringIO()):
             self.runner = OnPolicyRunner(
                 self.env, runner_config(config, self.env), log_dir=None, device=config.device
@@ -256,7 +265,7 @@ class Trainer:
         began, done = time.monotonic(), self.iteration / self.config.iterations
         self.algorithm.entropy_coef = self.config.entropy * max(0.0, 1 - 1.25 * done)
         for group in self.algorithm.feasibility_optimizer.param_groups:
-            group["lr"] = self.config.feasibility_learning_rate * 0.1**done
+            group["lr"] = self.config.feasibility_learning_rate * 0.05**done
         self.runner.learn(1)
         self.iteration += 1
         self.seconds += time.monotonic() - began
@@ -293,6 +302,7 @@ class Trainer:
         with atomic_write(self.checkpoint) as temporary:
             temporary.write_bytes(buffer.getvalue())
         self.env.reset_all()
+        self.algorithm.memory.clear()
 
     def resume(self) -> None:
         """Continue from the run folder's checkpoint.
@@ -427,7 +437,7 @@ def runner_config(config: TrainConfig, env: LocomotionEnv) -> dict[str, Any]:
             "label_steps": round(config.label_seconds / env.control_dt),
             "feasibility_learning_rate": config.feasibility_learning_rate,
             "feasibility_batch": config.feasibility_batch,
-            "feasibility_epochs": config.feasibility_epochs,
+            "feasibility_updates": config.feasibility_updates,
         },
     }
 

@@ -217,6 +217,11 @@ def test_a_setting_below_one_is_refused(name):
         TrainConfig(**{name: 0})
 
 
+def test_a_rollout_too_short_for_its_label_is_refused():
+    with pytest.raises(ConfigError, match="steps to 14 or more"):
+        Trainer(TrainConfig(**TINY | {"label_seconds": 1.0}))
+
+
 def test_the_generalist_trains_on_every_specialty():
     world = training_world(TrainConfig(terrain="general", rows=1, columns=8))
     assert [tile.name for tile in world.tiles[0]] == ["steps", "gaps", "slopes", "rubble"] * 2

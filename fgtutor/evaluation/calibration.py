@@ -43,7 +43,7 @@ class CalibrationConfig:
     """What terrains and episodes are drawn from."""
     taus: Literal["paper", "calibrated"] = "calibrated"
     """Thresholds of w_ood."""
-    relief: float = 0.1
+    relief: float = 0.06
     """A patch with at least this difference of heights is distinctive of its terrain, m."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped zoo."""
@@ -115,7 +115,9 @@ def _check(
     table, error = calibration(own.predicted, own.measured)
     taus = resolve_taus(config.taus, specialist)
 
-    def weight(patch: Tensor) -> float:
+    def weight(patch: Tensor) -> float | None:
+        if not len(patch):  # flat ground has nothing distinctive
+            return None
         with torch.inference_mode():
             loss = specialist.feasibility.reconstruction(patch)
         return round(ood_weight(loss, *taus).mean().item(), 4)
@@ -123,7 +125,9 @@ def _check(
     return {
         "samples": len(own.measured),
         "calibration_error": round(error, 4),
-        "calibration": [[None if np.isnan(v) else round(v, 4) for v in row] for row in table],
+        "calibration": [
+            [None if np.isnan(v) else round(float(v), 4) for v in row] for row in table
+        ],
         "taus": [round(tau, 4) for tau in taus],
         "w_ood_own": weight(own.patch),
         "w_ood_others": {
@@ -148,10 +152,10 @@ def report(results: Mapping[str, Mapping[str, Any]]) -> str:
         "|---" * (len(names) + 3) + "|",
     ]
     for name, row in results.items():
-        others = [f"{row['w_ood_others'][o]:.2f}" if o != name else "-" for o in names]
+        others = [row["w_ood_others"].get(o) for o in names]
         lines.append(
             f"| {name} | {row['calibration_error']:.3f} | {row['w_ood_own']:.2f} | "
-            + " | ".join(others)
+            + " | ".join("-" if w is None else f"{w:.2f}" for w in others)
             + " |"
         )
     return "\n".join(lines)

@@ -52,7 +52,7 @@ class EnvConfig:
     """Progress that counts as moving, m."""
     traverse_share: float = 0.6
     """Share of episodes that start at a tile's end and cross it; the others start anywhere."""
-    turn_share: float = 0.15
+    turn_share: float = 0.25
     """Share of episodes whose heading changes on the way, as a route's does."""
     promote_above: float = 0.5
     """Mean r_v of an unfailed episode from which its robot moves to a harder row."""

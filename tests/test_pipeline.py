@@ -1,0 +1,96 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import (
+    ConfigError,
+    InfeasibleCellError,
+    MapError,
+    OffMapError,
+    StorageError,
+    UnknownCellError,
+)
+from fgtutor.pipeline import PlanConfig, choose, plan_on_map, run
+from fgtutor.planning import Route
+from fgtutor.specialist import save_specialist
+
+
+@pytest.fixture
+def case(make_rolling, tmp_path):
+    """A flat map with one unknown cell, and a zoo of a sure and an unsure policy on disk."""
+    heights = np.zeros((30, 20))
+    heights[15, 10] = np.nan
+    ElevationMap(heights).save(tmp_path / "map.npz")
+    for name, f in (("sure", 0.9), ("unsure", 0.3)):
+        save_specialist(make_rolling(name, f=f), tmp_path / "zoo" / name)
+    return {
+        "map": tmp_path / "map.npz",
+        "zoo": tmp_path / "zoo",
+        "start": (0.5, 1.0),
+        "goal": (2.5, 1.0),
+        "taus": "paper",
+    }
+
+
+def test_the_command_plans_and_writes_the_route(case, tmp_path, capsys):
+    assert run(PlanConfig(json=tmp_path / "route.json", **case)) == 0
+    route = Route.from_json(json.loads((tmp_path / "route.json").read_text()))
+    assert route.names == ("sure", "unsure") and set(route.policies) == {0}
+    # 20 steps of f = 0.9; the unknown cell is worth a detour of no extra step.
+    assert route.cost == pytest.approx(20 / 0.9, rel=1e-5)
+    assert [15, 10] not in route.cells.tolist()
+    assert "20 steps" in capsys.readouterr().out
+
+
+def test_every_stage_is_kept(case, make_rolling):
+    zoo = {"a": make_rolling("a", f=0.4), "b": make_rolling("b", f=0.6)}
+    elevation = ElevationMap.load(case["map"])
+    plan = plan_on_map(elevation, zoo, case["start"], case["goal"], taus="paper")
+    assert plan.names == ("a", "b") and len(plan.tensors) == 2
+    assert torch.equal(plan.fused, torch.maximum(*plan.tensors))
+    assert plan.route.choices.shape == (20, 2)
+
+
+def test_tensors_already_computed_are_used(case, make_rolling):
+    elevation = ElevationMap.load(case["map"])
+    ones = torch.ones(30, 20, 8)
+    plan = plan_on_map(
+        elevation, {"a": make_rolling("a")}, case["start"], case["goal"], tensors={"a": ones}
+    )
+    assert plan.tensors[0] is ones and plan.route.cost == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"start": (9.0, 1.0)}, OffMapError, "start"),
+        ({"goal": (1.55, 1.05)}, UnknownCellError, "goal"),
+        ({"f_min": 0.95}, InfeasibleCellError, "f_min"),
+        ({"policies": ("wings",)}, ConfigError, "wings"),
+    ],
+)
+def test_bad_requests_say_which_and_what_to_do(case, change, error, message):
+    with pytest.raises(error, match=message):
+        run(PlanConfig(**case | change))
+
+
+def test_a_missing_map_and_a_folder_that_is_none(case, tmp_path):
+    with pytest.raises(MapError, match="nowhere"):
+        run(PlanConfig(**case | {"map": tmp_path / "nowhere.npz"}))
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StorageError, match="file"):
+        run(PlanConfig(json=tmp_path / "file" / "route.json", **case))
+
+
+def test_an_empty_zoo_is_refused(case):
+    with pytest.raises(ConfigError, match="at least one"):
+        plan_on_map(ElevationMap.load(case["map"]), {}, (0.5, 1.0), (2.5, 1.0))
+
+
+def test_choose_keeps_the_order_asked_for(make_rolling):
+    zoo = {name: make_rolling(name) for name in ("a", "b", "c")}
+    assert list(choose(zoo, ("c", "a"))) == ["c", "a"]
+    assert choose(zoo, ()) is zoo
