@@ -17,7 +17,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.terrain import SCALES, make_terrain
 
 RESOLUTION = 0.1
-WALL = 1.0  # m; far above every riser that a specialist knows
+WALL = 0.45  # m; more than twice the highest riser, less than what counts as a hole below it
 TARGET = Path(fgtutor.__file__).parent / "zoo" / "maps" / "toy_mixed.npz"
 
 

@@ -40,8 +40,8 @@ class DemoConfig:
     """Folder of specialist folders; default: the shipped ones."""
     taus: Literal["paper", "calibrated"] = "calibrated"
     """Thresholds of w_ood: the paper's, or each specialist's own."""
-    switch_cost: float = 0.0
-    """Extra cost of changing the policy; 0 is the paper's."""
+    switch_cost: float = 3.0
+    """Extra cost of changing the policy; at the paper's 0 equals take turns from cell to cell."""
     video: Literal["mp4", "gif"] = "mp4"
     """Format of the film."""
 

@@ -155,9 +155,11 @@ class ElevationMap:
         return self._replace(self.heights[ix, iy], known=self.known)
 
     def levelled(self, depth: float, reach: float) -> Self:
-        """Return the map with deep holes raised to `depth` below the highest ground near them.
+        """Return the map with deep holes raised to `depth` below the ground around them.
 
-        Near is a square of round(reach / resolution) cells to each side; at the border the edge
+        A hole has higher ground on both sides: the ground around it is the grey closing of the map
+        with a square of round(reach / resolution) cells to each side, which fills what is narrower
+        than the square and leaves the foot of a wall or of a slope alone. At the border the edge
         cell continues.
 
         Raises:
@@ -167,8 +169,13 @@ class ElevationMap:
             raise MapError(f"levelled needs depth >= 0 and reach >= 0 m, got {depth} and {reach}")
         if np.isnan(self.heights).any():
             raise MapError("levelled needs a height in every cell: call filled() first")
-        window = 2 * round(reach / self.resolution) + 1
-        highest = ndimage.grey_dilation(self.heights, size=(window, window), mode="nearest")
+        cells = round(reach / self.resolution)
+        square = (2 * cells + 1, 2 * cells + 1)
+        # Closed on a padded map: scipy's own border would erode what it has just dilated.
+        padded = np.pad(self.heights, 2 * cells, mode="edge")
+        closed = ndimage.grey_erosion(ndimage.grey_dilation(padded, size=square), size=square)
+        inside = tuple(slice(2 * cells, 2 * cells + n) for n in self.shape)
+        highest = closed[inside]
         return self._replace(
             np.maximum(self.heights, highest - np.float32(depth)), known=self.known
         )

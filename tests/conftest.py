@@ -97,7 +97,7 @@ def make_rolling(make_specialist) -> Callable[..., Specialist]:
             "policy": policy,
             "feasibility": net,
             "command": (0.85, 0.0, 0.0),
-            "quantiles": {"0.5": 1.0, "0.9": 90.0, "0.95": 95.0, "0.99": 99.0},
+            "quantiles": {"0.5": 1.0, "0.9": 9e3, "0.95": 9.5e3, "0.99": 9.9e3},
         }
         return make_specialist(name, **(values | fields))
 

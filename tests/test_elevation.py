@@ -153,13 +153,39 @@ def test_filled_takes_the_nearest_known_height() -> None:
 def test_levelled_against_a_naive_loop(elevation: ElevationMap, depth: float, reach: float) -> None:
     filled = elevation.filled()
     n = round(reach / elevation.resolution)
-    expected = filled.heights.copy()
-    for ix, iy in np.ndindex(filled.shape):
-        near = filled.heights[max(ix - n, 0) : ix + n + 1, max(iy - n, 0) : iy + n + 1]
-        expected[ix, iy] = max(filled.heights[ix, iy], near.max() - np.float32(depth))
+    ground = np.pad(filled.heights, 2 * n, mode="edge")
+    for pick in (np.max, np.min):  # dilation, then erosion
+        source = np.pad(ground, n, mode="edge")
+        ground = np.array(
+            [
+                [pick(source[i : i + 2 * n + 1, j : j + 2 * n + 1]) for j in range(ground.shape[1])]
+                for i in range(ground.shape[0])
+            ]
+        )
+    ground = ground[2 * n : 2 * n + filled.shape[0], 2 * n : 2 * n + filled.shape[1]]
     levelled = filled.levelled(depth, reach)
-    np.testing.assert_array_equal(levelled.heights, expected)
+    np.testing.assert_array_equal(
+        levelled.heights, np.maximum(filled.heights, ground - np.float32(depth))
+    )
     np.testing.assert_array_equal(levelled.known, elevation.known)
+
+
+def test_levelled_raises_a_gap_but_not_the_foot_of_a_wall_or_a_ramp() -> None:
+    heights = np.zeros((60, 20))
+    heights[10:13] = -1.0  # a gap of 0.3 m
+    heights[30:32] = 1.2  # a wall
+    heights[44:] = 0.1 * np.arange(16)[:, None]  # a ramp of 45 degrees
+    levelled = ElevationMap(heights, resolution=0.1).levelled(0.5, 0.8).heights
+    assert levelled[10:13] == pytest.approx(-0.5)
+    heights[10:13] = -0.5
+    np.testing.assert_allclose(levelled, heights, atol=1e-6)
+
+
+def test_levelled_sees_a_gap_beside_a_wall() -> None:
+    heights = np.zeros((40, 20))
+    heights[20:23], heights[:, 10:12] = -1.0, 1.0
+    levelled = ElevationMap(heights, resolution=0.1).levelled(0.5, 0.3).heights
+    assert levelled[21, 5] == pytest.approx(-0.5)
 
 
 def test_levelled_needs_a_filled_map_and_positive_numbers() -> None:

@@ -46,8 +46,9 @@ def test_rows_name_every_outcome(config):
     # On flat ground rolling is enough; a policy that predicts f = 0.05 refuses everywhere (f_min).
     assert rows["flat", "steps"]["successes"] == rows["flat", "ours"]["successes"] == 3
     assert rows["flat", "gaps"]["failures"]["no_route"] == 3
-    # A rolling toy that believes in itself drops into the first gap.
-    assert rows["gaps", "steps"]["failures"]["fell"] == 3
+    # A rolling toy that believes in itself drops an axle into the first gap, and hangs there.
+    assert rows["gaps", "steps"]["successes"] == 0
+    assert rows["gaps", "steps"]["failures"]["no_route"] == 0
 
 
 def test_the_number_of_workers_changes_nothing(config, monkeypatch):

@@ -53,6 +53,8 @@ class MatrixConfig:
     """Thresholds of w_ood."""
     f_min: float = 0.1
     """Edges less feasible than this do not exist."""
+    switch_cost: float = 0.0
+    """Extra cost of changing the policy; 0 is the paper's."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped zoo."""
     workers: int = 0
@@ -119,6 +121,7 @@ def evaluate_batch(config: MatrixConfig, terrain: str, trials: Sequence[int]) ->
                     ground.goal,
                     taus=config.taus,
                     f_min=config.f_min,
+                    switch_cost=config.switch_cost,
                     tensors=tensors[i],
                 ).route
             except PlanningError:
@@ -217,7 +220,10 @@ def run(config: MatrixConfig) -> int:
         check_writable(config.json)
     rows = evaluate(config, progress=True)
     print(table(rows))
-    print(f"success in %, {config.trials} trials a cell, tau {config.taus}, seed {config.seed}")
+    print(
+        f"success in %, {config.trials} trials a cell, tau {config.taus}, seed {config.seed}, "
+        f"switch cost {config.switch_cost:g}"
+    )
     if config.json:
         with atomic_write(config.json) as temporary:
             temporary.write_text(json.dumps(rows, indent=1))
