@@ -24,24 +24,17 @@ os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from rsl_rl.algorithms import PPO
 from rsl_rl.runners import OnPolicyRunner
-from rsl_rl.utils import reduce_gradients_in_buckets
-from torch import Tensor
 from tqdm import tqdm
 
 from fgtutor.errors import CheckpointError, ConfigError
-from fgtutor.feasibility import FeasibilityNet
+from fgtutor.ppo import QUANTILES, FeasibilityPPO
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.specialist import Specialist, save_specialist
 from fgtutor.storage import atomic_write, make_folder
 from fgtutor.symmetry import SymmetricMLPModel
 from fgtutor.terrain import SCALES, World, make_terrain
-
-QUANTILES = (0.5, 0.9, 0.95, 0.99)
-"""Quantiles of L_recon that a specialist stores, for calibrated taus."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,129 +99,6 @@ class TrainConfig:
     def folder(self) -> Path:
         """The run folder."""
         return self.out or Path("runs") / f"{self.robot}-{self.terrain}"
-
-
-def feasibility_labels(
-    tracking: Float[Tensor, "time envs 3"], window: int
-) -> tuple[Float[Tensor, "time envs"], Bool[Tensor, "time envs"]]:
-    """Return the mean r_v over the next `window` steps, and where that mean is trustworthy.
-
-    `tracking[t]` holds (r_v, failed, ended) of the step that led to time t. A failure makes
-    the rest of its window zero; a time-out cuts it short; no label reaches into the next episode.
-    A label counts if at least half of its window was seen. `window` 0 means 1, the paper's label.
-    """
-    window = max(window, 1)
-    steps = tracking.shape[0]
-    total = torch.zeros_like(tracking[..., 0])
-    seen = torch.zeros_like(total)
-    running = torch.ones_like(total, dtype=torch.bool)
-    failed_before = torch.zeros_like(running)
-    for ahead in range(1, window + 1):
-        # Steps of a failed episode that never happened still count, as zeros.
-        seen += failed_before
-        if ahead >= steps:
-            continue
-        r_v, failed, ended = tracking[ahead:].unbind(-1)
-        now = running[:-ahead]
-        total[:-ahead] += r_v * now
-        seen[:-ahead] += now
-        failed_before[:-ahead] |= now & (failed > 0)
-        running[:-ahead] = now & (ended == 0)
-        running[-ahead:] = False
-    return total / seen.clamp(min=1), seen >= (window + 1) // 2
-
-
-class FeasibilityPPO(PPO):
-    """rsl_rl's PPO that also fits the Feasibility-Net to each rollout before it learns from it.
-
-    The two share data and nothing else: separate networks, optimisers and losses.
-    """
-
-    def __init__(
-        self,
-        *args: Any,
-        label_steps: int,
-        feasibility_learning_rate: float,
-        feasibility_batch: int,
-        feasibility_updates: int,
-        **kwargs: Any,
-    ) -> None:
-        """Add a Feasibility-Net sized by the `patch` group to what PPO builds."""
-        super().__init__(*args, **kwargs)
-        num_points = self.storage.observations["patch"].shape[-1]
-        self.feasibility = FeasibilityNet(num_points).to(self.device)
-        self.feasibility_optimizer = torch.optim.Adam(
-            self.feasibility.parameters(), lr=feasibility_learning_rate
-        )
-        self.label_steps = label_steps
-        self.feasibility_batch, self.feasibility_updates = feasibility_batch, feasibility_updates
-        self.metrics: dict[str, float] = {}
-        self.memory: list[tuple[Tensor, Tensor, Tensor]] = []
-
-    def update(self) -> dict[str, float]:
-        """Fit the Feasibility-Net, then update the policy (which empties the storage)."""
-        tracking = self.storage.observations["tracking"]
-        self.metrics = {
-            "reward": self.storage.rewards.mean().item(),
-            "r_v": tracking[..., 0].mean().item(),
-            "failed": tracking[..., 1].sum().item() / max(1.0, tracking[..., 2].sum().item()),
-        }
-        self.metrics |= self.fit_feasibility()
-        self.metrics |= super().update()
-        return self.metrics
-
-    def fit_feasibility(self) -> dict[str, float]:
-        """Fit the net to the labelled patches at hand; return the mean of each loss part.
-
-        These are the rollouts since the last checkpoint: neighbours in one rollout are too alike to
-        learn from one rollout at a time, and labels of long ago describe another policy.
-        """
-        observations = self.storage.observations
-        label, valid = feasibility_labels(observations["tracking"], self.label_steps)
-        self.memory.append(
-            (observations["patch"][valid], observations["command"][valid], label[valid])
-        )
-        patch, command, label = (torch.cat(parts) for parts in zip(*self.memory, strict=True))
-        sums: dict[str, float] = {}
-        shape = (self.feasibility_updates, self.feasibility_batch)
-        batches = torch.randint(len(label), shape, device=label.device)
-        for batch in batches:
-            loss, parts = self.feasibility.loss(patch[batch], command[batch], label[batch])
-            self.feasibility_optimizer.zero_grad()
-            loss.backward()
-            if self.is_multi_gpu:
-                reduce_gradients_in_buckets(
-                    self.feasibility.parameters(), self.gpu_world_size, self.grad_reduce_bucket_mb
-                )
-            self.feasibility_optimizer.step()
-            for name, value in parts.items():
-                sums[name] = sums.get(name, 0.0) + value.item() / len(batches)
-        with torch.no_grad():
-            sample = patch[batches[:8].flatten()]
-            reconstruction = self.feasibility.reconstruction(sample)
-        levels = torch.tensor(QUANTILES, device=reconstruction.device)
-        quantiles = torch.quantile(reconstruction, levels).tolist()
-        losses = {f"feasibility_{name}": value for name, value in sums.items()}
-        return losses | {f"L_recon_{q}": v for q, v in zip(QUANTILES, quantiles, strict=True)}
-
-    def broadcast_parameters(self) -> None:
-        """Copy all networks from the first process to the others."""
-        super().broadcast_parameters()
-        for tensor in self.feasibility.state_dict().values():
-            torch.distributed.broadcast(tensor, src=0)
-
-    def save(self) -> dict:
-        """Return the state of all networks and optimisers."""
-        return super().save() | {
-            "feasibility_state_dict": self.feasibility.state_dict(),
-            "feasibility_optimizer_state_dict": self.feasibility_optimizer.state_dict(),
-        }
-
-    def load(self, loaded_dict: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
-        """Take over the state that `save` returned."""
-        self.feasibility.load_state_dict(loaded_dict["feasibility_state_dict"], strict=strict)
-        self.feasibility_optimizer.load_state_dict(loaded_dict["feasibility_optimizer_state_dict"])
-        return super().load(loaded_dict, load_cfg, strict)
 
 
 class Trainer:

@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from fgtutor.errors import CheckpointError, ConfigError, StorageError
+from fgtutor.ppo import feasibility_labels
 from fgtutor.specialist import load_specialist
-from fgtutor.training import TrainConfig, Trainer, feasibility_labels, train, training_world
+from fgtutor.training import TrainConfig, Trainer, train, training_world
 
 TINY = {
     "num_envs": 4,

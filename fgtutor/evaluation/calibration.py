@@ -21,12 +21,12 @@ from tqdm import tqdm
 from fgtutor.errors import ConfigError
 from fgtutor.evaluation.metrics import calibration
 from fgtutor.feasibility import ood_weight
+from fgtutor.ppo import feasibility_labels
 from fgtutor.robots import env_class
 from fgtutor.specialist import Specialist, load_zoo
 from fgtutor.storage import atomic_write, check_writable
 from fgtutor.tensorization import resolve_taus
 from fgtutor.terrain import World, make_terrain
-from fgtutor.training import feasibility_labels
 
 
 @dataclass(frozen=True, kw_only=True)
