@@ -4,7 +4,6 @@ Reads the shipped demo map and zoo; writes plan.png, route.json, drive.mp4 and d
 strip) into a folder, and says what each shows. Source: paper, Sec. III, start to end.
 """
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.execution import execute
 from fgtutor.pipeline import plan_on_map
 from fgtutor.specialist import load_zoo
-from fgtutor.storage import atomic_write, storage_error
+from fgtutor.storage import atomic_write, make_folder, write_json
 from fgtutor.teach.figures import plan_figure, save_figure
 from fgtutor.teach.videos import film_strip, save_video
 from fgtutor.tensorization import assess, resolve_taus, steps_on_known
@@ -50,10 +49,7 @@ def run(config: DemoConfig) -> int:
     """Run the demo; return 0 if the robot reached its goal, else 1 (the pictures show why)."""
     began = time.monotonic()
     torch.set_num_threads(1)  # small networks: on a busy machine more threads mostly wait
-    try:
-        config.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(config.out, error) from error
+    make_folder(config.out)
 
     def announce(file: str, what: str) -> None:
         print(f"{time.monotonic() - began:5.1f} s  {config.out / file}: {what}", flush=True)
@@ -70,8 +66,7 @@ def run(config: DemoConfig) -> int:
         weights[name], tensors[name] = assessment.ood(*taus), assessment.weighted(*taus)
         tensors[name][closed] = 0
     plan = plan_on_map(elevation, zoo, START, GOAL, tensors=tensors, switch_cost=config.switch_cost)
-    with atomic_write(config.out / "route.json") as path:
-        path.write_text(json.dumps(plan.route.to_json(), indent=1))
+    write_json(config.out / "route.json", plan.route.to_json())
     announce("route.json", str(plan.route))
     save_figure(plan_figure(elevation, plan, weights), config.out / "plan.png")
     announce("plan.png", "the map and route, w_ood, F_max and the policy map")

@@ -4,7 +4,6 @@ Reads an elevation map and a zoo; gives a `Plan` that keeps every stage, so that
 curious reader can look at each. Source: paper, Sec. III-B and III-C.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from fgtutor.errors import ConfigError
 from fgtutor.fusion import fuse
 from fgtutor.planning import Route, plan
 from fgtutor.specialist import Specialist, load_zoo
-from fgtutor.storage import atomic_write, check_writable
+from fgtutor.storage import check_writable, write_json
 from fgtutor.tensorization import Taus, tensorize
 
 
@@ -138,7 +137,6 @@ def run(config: PlanConfig) -> int:
         )
     print(planned.route)
     if config.json:
-        with atomic_write(config.json) as temporary:
-            temporary.write_text(json.dumps(planned.route.to_json(), indent=1))
+        write_json(config.json, planned.route.to_json())
         print(f"route -> {config.json}")
     return 0

@@ -5,11 +5,13 @@ Reads nothing; gives a temporary path in the target's own folder and moves it in
 """
 
 import errno
+import json
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from fgtutor.errors import StorageError
 
@@ -51,6 +53,12 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             raise
     except OSError as error:
         raise storage_error(path, error) from error
+
+
+def write_json(path: str | Path, data: Any) -> None:
+    """Write plain values as JSON, whole or not at all; raises `StorageError` as `atomic_write`."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=1))
 
 
 def check_writable(path: str | Path) -> None:

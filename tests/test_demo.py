@@ -8,11 +8,9 @@ from PIL import Image
 from fgtutor import demo
 from fgtutor.errors import SpecialistError, StorageError
 from fgtutor.routes import Route
-from fgtutor.specialist import DESCRIPTION, ZOO
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not any((ZOO / "toy").glob(f"*/{DESCRIPTION}")), reason="no toy zoo is shipped")
 def test_the_demo_reaches_the_goal_and_says_so(tmp_path, capsys):
     out = tmp_path / "new" / "demo"
     assert demo.run(demo.DemoConfig(out=out, video="gif")) == 0

@@ -6,7 +6,6 @@ and w_ood on what it met at home with w_ood on what the other specialists meet a
 Source: paper, Sec. III-A (feasibility is predicted r_v) and Eq. 4.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from fgtutor.feasibility import ood_weight
 from fgtutor.ppo import feasibility_labels
 from fgtutor.robots import env_class
 from fgtutor.specialist import Specialist, load_zoo
-from fgtutor.storage import atomic_write, check_writable
+from fgtutor.storage import check_writable, write_json
 from fgtutor.tensorization import resolve_taus
 from fgtutor.terrain import World, make_terrain
 
@@ -170,7 +169,6 @@ def run(config: CalibrationConfig) -> int:
     samples = min(row["samples"] for row in results.values())
     print(f"at least {samples:,} labelled patches each, tau {config.taus}, seed {config.seed}")
     if config.json:
-        with atomic_write(config.json) as temporary:
-            temporary.write_text(json.dumps(results, indent=1))
+        write_json(config.json, results)
         print(f"results -> {config.json}")
     return 0

@@ -5,7 +5,6 @@ every failure. Trial k of a terrain is the same ground for all policies.
 Source: paper, Sec. IV-B (Table II): a trial fails if no route is found or the goal is not reached.
 """
 
-import json
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -24,7 +23,7 @@ from fgtutor.execution import execute_batch
 from fgtutor.pipeline import plan_on_map
 from fgtutor.planning import Route
 from fgtutor.specialist import Specialist, load_zoo
-from fgtutor.storage import atomic_write, check_writable
+from fgtutor.storage import check_writable, write_json
 from fgtutor.tensorization import tensorize
 from fgtutor.terrain import SCALES, make_terrain
 
@@ -225,8 +224,7 @@ def run(config: MatrixConfig) -> int:
         f"switch cost {config.switch_cost:g}"
     )
     if config.json:
-        with atomic_write(config.json) as temporary:
-            temporary.write_text(json.dumps(rows, indent=1))
+        write_json(config.json, rows)
         print(f"rows -> {config.json}")
     return 0
 
