@@ -13,7 +13,7 @@ from fgtutor.errors import FgtutorError
 
 COMMANDS = {
     "demo": ("demo", "DemoConfig", "plan over a mixed terrain and drive it with the toy robot"),
-    "train": ("training", "TrainConfig", "train a specialist with its Feasibility-Net"),
+    "train": ("training", "config_of", "train a specialist with its Feasibility-Net"),
     "plan": ("pipeline", "PlanConfig", "plan a route over a map file"),
     "evaluate matrix": (
         "evaluation.matrix",
@@ -27,7 +27,7 @@ COMMANDS = {
     ),
     "doctor": ("doctor", "DoctorConfig", "say what this machine has, lacks and needs"),
 }
-"""Command: module under fgtutor, its config dataclass, what it is for."""
+"""Command: module under fgtutor, its config dataclass (or what picks it), what it is for."""
 
 USAGE, INTERRUPTED = 2, 130
 """Exit codes: a mistake that the message explains; Ctrl-C (128 + SIGINT, as shells report it)."""
@@ -73,7 +73,10 @@ def _run(command: str, options: Sequence[str]) -> int:
     module_name, config_name, _ = COMMANDS[command]
     try:
         module = importlib.import_module(f"fgtutor.{module_name}")
-        config = tyro.cli(getattr(module, config_name), args=options, prog=f"fgtutor {command}")
+        config_class = getattr(module, config_name)
+        if not isinstance(config_class, type):
+            config_class = config_class(options)
+        config = tyro.cli(config_class, args=options, prog=f"fgtutor {command}")
         return module.run(config) or 0
     except FgtutorError as error:
         print(f"fgtutor {command}: {error}", file=sys.stderr)

@@ -180,6 +180,29 @@ class ElevationMap:
             np.maximum(self.heights, highest - np.float32(depth)), known=self.known
         )
 
+    def smoothed(self, width: float) -> Self:
+        """Return the map seen through a triangular window that reaches `width` to each side, m.
+
+        Sampled every `width` metres, the map as it is would hide where between two samples an edge
+        lies; smoothed, its height there tells. A width of one cell or less changes nothing.
+
+        Raises:
+            MapError: Some height is NaN (call `filled` first), or the width is negative or NaN.
+        """
+        if not width >= 0:
+            raise MapError(f"smoothed needs a width of 0 m or more, got {width}")
+        if np.isnan(self.heights).any():
+            raise MapError("smoothed needs a height in every cell: call filled() first")
+        cells = round(width / self.resolution)
+        if cells <= 1:
+            return self
+        box = np.ones(cells)
+        window = np.convolve(box, box) / cells**2
+        heights = self.heights.astype(np.float64)
+        for axis in (0, 1):
+            heights = ndimage.convolve1d(heights, window, axis=axis, mode="nearest")
+        return self._replace(heights, known=self.known)
+
     def crop(self, x0: float, y0: float, x1: float, y1: float) -> Self:
         """Return the cells whose centres lie in the rectangle, which may reach beyond the map.
 

@@ -26,7 +26,7 @@ class TerrainScale:
     """Width of a terrain, along y, m."""
     apron: float = 1.5
     """Length of the flat ground at either end, m; start and goal lie in the middle of it."""
-    chasm_depth: tuple[float, float, float] = (0.03, 0.5, 1.0)
+    chasm_depth: tuple[float, float, float] = (0.03, 0.4, 0.6)
     """Depth of gaps and of the chasm beside a bridge at difficulty 0, 0.7 and 1, m. The first must
     be survivable for a robot that falls in, or nothing is learned; the last is as good as none."""
     ease: float = 0.2
@@ -83,19 +83,19 @@ SCALES = {
         resolution=0.1,
         length=9.0,
         chasm_depth=(0.05, 0.5, 1.0),
-        step_height=(0.06, 0.15),
+        step_height=(0.06, 0.16),
         # A toy drives in a slice: what differs beside it would only blur what its terrains are.
         block_share=0.0,
         lane_share=0.0,
         bank_share=0.0,
         step_tread=(0.75, 1.1),
-        gap_width=(0.1, 0.3),
+        gap_width=(0.1, 0.4),
         bridge_width=(1.6, 0.6),
         slope_angle=(8.0, 40.0),
         slope_height=0.7,
         stair_rise=0.16,
         stair_run=0.4,
-        rubble_height=0.1,
+        rubble_height=0.12,
         rubble_size=(0.1, 0.2),
         rubble_density=0.3,
         mixed=("steps", "gaps", "slopes", "rubble"),
@@ -345,8 +345,22 @@ def _rubble(course: Course, x0: float, x1: float) -> float:
     return course.middle
 
 
+def _gentle(course: Course, x0: float, x1: float) -> float:
+    """Lay low blocks along the way, and pits and walls beside it, seen but never stepped on."""
+    columns = course.cuts(x1 - x0, 0.7, 1.4)
+    for near, far in pairwise(columns):
+        right, left = (course.snap(course.middle + side * course.draw(0.45, 1.0)) for side in (-1, 1))
+        top = course.dice.uniform(0.0, 0.05) * course.severity
+        course.block(x0 + near, x0 + far, right, left, top)
+        for y0, y1 in ((0.0, right), (left, course.width)):
+            beside = course.dice.choice((top, course.dice.uniform(0.0, 0.4), -0.4))
+            course.block(x0 + near, x0 + far, y0, y1, float(beside))
+    return course.middle
+
+
 OBSTACLES: dict[str, Callable[[Course, float, float], float]] = {
     "flat": _flat,
+    "gentle": _gentle,
     "steps": _steps,
     "gaps": _gaps,
     "bridge": _bridge,
@@ -356,3 +370,5 @@ OBSTACLES: dict[str, Callable[[Course, float, float], float]] = {
     "rubble": _rubble,
 }
 """Each lays its obstacle over the full width from x0 to x1 and returns the y of the way over it."""
+SPREAD = {"gentle": 0.1, "bridge": 0.03, "valley": 0.15}
+"""How far beside the way over an obstacle a robot may walk, m; over the others, anywhere."""

@@ -16,6 +16,13 @@ from torch import Tensor
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 
+HOLE_DEPTH = 0.3
+"""Depth at which a hole counts as bottomless, m: deeper cells look alike to a patch."""
+HOLE_REACH = 0.4
+"""How far the ground that a hole is measured against may be, m."""
+SPACING = 0.1
+"""Distance between neighbouring points of a patch, m."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PatchGrid:
@@ -27,7 +34,7 @@ class PatchGrid:
     """Reach behind the robot's centre, m."""
     half_width: float = 0.5
     """Reach to either side, m."""
-    spacing: float = 0.1
+    spacing: float = SPACING
     """Distance between neighbouring points, m."""
     footprint: tuple[float, float] = (0.2, 0.1)
     """Half length and half width of the area whose median is the ground under the robot, m."""
@@ -69,19 +76,14 @@ class PatchGrid:
         return inside.nonzero().flatten()
 
 
-HOLE_DEPTH = 0.5
-"""Depth at which a hole counts as bottomless, m: deeper cells look alike to a patch."""
-HOLE_REACH = 0.8
-"""How far the ground that a hole is measured against may be, m."""
-
-
 def prepare(elevation: ElevationMap) -> ElevationMap:
-    """Return the map that patches are taken from: unknown cells filled, deep holes levelled.
+    """Return the map that patches are taken from: filled, deep holes levelled, not finer than them.
 
-    A chasm's depth would dominate L_recon while saying nothing about how hard it is to cross; cells
-    more than `HOLE_DEPTH` below the highest ground within `HOLE_REACH` are raised to that depth.
+    A slot's depth would dominate L_recon while saying nothing about how hard it is to cross; cells
+    more than `HOLE_DEPTH` below the ground around them are raised to that depth. A finer map is
+    smoothed to the points' `SPACING`, so that an edge between two of them is felt by both.
     """
-    return elevation.filled().levelled(depth=HOLE_DEPTH, reach=HOLE_REACH)
+    return elevation.filled().levelled(depth=HOLE_DEPTH, reach=HOLE_REACH).smoothed(SPACING)
 
 
 def sample_heights(

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from fgtutor.boxes import Box, boxes_from_elevation, columns, rasterise
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import TerrainError
-from fgtutor.obstacles import OBSTACLES, SCALES, Course, TerrainScale
+from fgtutor.obstacles import OBSTACLES, SCALES, SPREAD, Course, TerrainScale
 
 __all__ = [
     "SCALES",
@@ -74,6 +74,12 @@ class Terrain:
     """Which obstacle lies where."""
     lane: tuple[Point, ...] = ()
     """A way from start to goal that the terrain was made for: over the beam, along the valley."""
+
+    @property
+    def spread(self) -> float:
+        """How far beside the lane a robot may walk, m."""
+        anywhere = 0.3 * self.elevation.size[1]
+        return min((SPREAD.get(part.name, anywhere) for part in self.sections), default=anywhere)
 
     @classmethod
     def from_elevation(

@@ -9,21 +9,23 @@ Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
 import contextlib
 import dataclasses
 import io
+import itertools
 import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 # rsl_rl's logger imports GitPython, which otherwise refuses to load where git is not installed.
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 import numpy as np
 import torch
+import tyro
 from rsl_rl.runners import OnPolicyRunner
 from tqdm import tqdm
 
@@ -31,7 +33,7 @@ from fgtutor.errors import CheckpointError, ConfigError
 from fgtutor.ppo import QUANTILES, FeasibilityPPO
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.specialist import Specialist, save_specialist
+from fgtutor.specialist import Specialist, load_specialist, save_specialist
 from fgtutor.storage import atomic_write, make_folder
 from fgtutor.symmetry import SymmetricMLPModel
 from fgtutor.terrain import SCALES, World, make_terrain
@@ -49,6 +51,10 @@ class TrainConfig:
     """Run folder for checkpoints, curves and the specialist; default runs/ROBOT-TERRAIN."""
     resume: bool = False
     """Continue from the run folder's checkpoint."""
+    start_from: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    """Specialist folder whose policy to start from, such as a walker's; default: from nothing."""
+    hours: float = 0.0
+    """Stop and save after this many hours; --resume goes on. 0 sets no limit."""
     iterations: int = 200
     """PPO iterations in all."""
     num_envs: int = 128
@@ -63,7 +69,7 @@ class TrainConfig:
     """Window over which r_v is averaged into a label, s; 0 is the paper's instantaneous label."""
     rows: int = 6
     """Difficulty rows of the training world."""
-    columns: int = 24
+    columns: int = 12
     """Terrain variants per row."""
     planning_speed: float = 0.85
     """Forward speed of the command that planning pairs with every patch, m/s."""
@@ -77,6 +83,10 @@ class TrainConfig:
     """PPO entropy coefficient at the start; it falls to zero over the run."""
     initial_std: float = 0.6
     """Standard deviation of the action noise at the start."""
+    warm_std: float = 0.25
+    """The same for a run that starts from a trained policy."""
+    critic_warmup: int = 10
+    """First iterations of such a run in which only the critic learns, since it is new."""
     feasibility_learning_rate: float = 2e-3
     """Adam learning rate of the Feasibility-Net; it falls to a twentieth over the run."""
     feasibility_batch: int = 512
@@ -92,13 +102,44 @@ class TrainConfig:
         for name in ("iterations", "num_envs", "steps", "save_every", "rows", "columns", "threads"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not self.label_seconds >= 0:
-            raise ConfigError(f"label_seconds must be 0 or more, got {self.label_seconds}")
+        for name in ("label_seconds", "hours", "critic_warmup"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must be 0 or more, got {getattr(self, name)}")
 
     @property
     def folder(self) -> Path:
         """The run folder."""
         return self.out or Path("runs") / f"{self.robot}-{self.terrain}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class A1TrainConfig(TrainConfig):
+    """The same with the A1's sizes: 9 million samples, half an hour on one core."""
+
+    robot: str = "a1"
+    terrain: str = "gentle"
+    iterations: int = 350
+    num_envs: int = 640
+    save_every: int = 50
+    label_seconds: float = 0.8
+    rows: int = 10
+    columns: int = 5
+    planning_speed: float = 0.65
+    hidden: tuple[int, ...] = (256, 128)
+    gamma: float = 0.99
+    entropy: float = 0.001
+    initial_std: float = 0.5
+    feasibility_learning_rate: float = 1e-3
+
+
+CONFIGS = {"toy": TrainConfig, "a1": A1TrainConfig}
+"""The default sizes of a training, by robot."""
+
+
+def config_of(words: Sequence[str]) -> type[TrainConfig]:
+    """Return the config class for command line `words`, which may hold `--robot NAME`."""
+    following = dict(itertools.pairwise([w for word in words for w in word.split("=", 1)]))
+    return CONFIGS.get(following.get("--robot", "toy"), TrainConfig)
 
 
 class Trainer:
@@ -110,6 +151,7 @@ class Trainer:
         torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         self.env = make_training_env(config)
+        self.iteration = 0
         half_window = (round(config.label_seconds / self.env.control_dt) + 1) // 2
         if config.steps <= half_window:
             raise ConfigError(
@@ -121,7 +163,9 @@ class Trainer:
                 self.env, runner_config(config, self.env), log_dir=None, device=config.device
             )
         self.algorithm: FeasibilityPPO = self.runner.alg  # type: ignore[assignment]
-        self.iteration = 0
+        self.samples_before = 0
+        if config.start_from:
+            self._start_from(load_specialist(config.start_from))
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
 
@@ -130,8 +174,30 @@ class Trainer:
         """Where this run's checkpoint lies."""
         return self.config.folder / "checkpoint.pt"
 
+    @property
+    def samples(self) -> int:
+        """Control steps learned from so far, those of the policy it started from included."""
+        own = self.iteration * self.config.num_envs * self.config.steps
+        return self.samples_before + own
+
+    def _start_from(self, specialist: Specialist) -> None:
+        """Take over a trained policy, all but its action noise; the Feasibility-Net stays new."""
+        mine = self.algorithm.get_policy()
+        if specialist.robot != self.config.robot or specialist.policy.obs_dim != mine.obs_dim:
+            raise CheckpointError(
+                f"{self.config.start_from} drives {specialist.robot} on {specialist.policy.obs_dim}"
+                f" observations, {self.config.robot} needs {mine.obs_dim}: start from another"
+            )
+        self.samples_before = int(specialist.provenance.get("samples", 0))
+        noise = {k: v for k, v in mine.state_dict().items() if k.startswith("distribution")}
+        mine.load_state_dict(specialist.policy.state_dict() | noise)
+
     def iterate(self) -> dict[str, float]:
         """Collect one rollout, learn from it, and return this iteration's numbers."""
+        if self.config.start_from and self.iteration in (0, self.config.critic_warmup):
+            warm = self.iteration < self.config.critic_warmup
+            self.algorithm.get_policy().requires_grad_(not warm)
+            self.algorithm.learning_rate = self.config.learning_rate
         began, done = time.monotonic(), self.iteration / self.config.iterations
         self.algorithm.entropy_coef = self.config.entropy * max(0.0, 1 - 1.25 * done)
         for group in self.algorithm.feasibility_optimizer.param_groups:
@@ -141,7 +207,7 @@ class Trainer:
         self.seconds += time.monotonic() - began
         row = {
             "iteration": self.iteration,
-            "samples": self.iteration * self.env.num_envs * self.config.steps,
+            "samples": self.samples,
             "seconds": self.seconds,
             "row": self.env.row.float().mean().item(),
             "std": self.algorithm.get_policy().output_std.mean().item(),
@@ -151,11 +217,12 @@ class Trainer:
         return row
 
     def save(self) -> None:
-        """Write the checkpoint atomically, and begin all episodes anew.
+        """Write the checkpoint atomically, and a snapshot, and go on in a new world.
 
         Physics engines keep caches that no checkpoint can hold. So a checkpoint is a point where
         the physics is rebuilt, in the run that goes on as in the run that resumes: both continue
-        from the same state, bit for bit.
+        from the same state, bit for bit. The new world holds other terrain of the same kind, so
+        that a policy sees many variants of it and a simulation at a time only few.
         """
         state = {
             "config": json.dumps(comparable(self.config)),
@@ -171,8 +238,15 @@ class Trainer:
         torch.save(state, buffer)
         with atomic_write(self.checkpoint) as temporary:
             temporary.write_bytes(buffer.getvalue())
-        self.env.reset_all()
+        save_specialist(self.specialist(), self.config.folder / "snapshots" / f"{self.iteration}")
+        self._renew(state["env"])
         self.algorithm.memory.clear()
+
+    def _renew(self, state: dict[str, torch.Tensor]) -> None:
+        """Move to the world that belongs to this iteration, with the curriculum of `state`."""
+        self.env = self.runner.env = make_training_env(self.config, self.iteration)
+        self.env.load_state_dict(state)
+        self.env.reset_all()
 
     def resume(self) -> None:
         """Continue from the run folder's checkpoint.
@@ -197,9 +271,10 @@ class Trainer:
                 f"{path} belongs to another run: {what}. Use the same settings, or another --out"
             )
         self.algorithm.load(state["algorithm"])
-        self.env.load_state_dict(state["env"])
-        self.env.reset_all()
+        warm = self.config.start_from and state["iteration"] < self.config.critic_warmup
+        self.algorithm.get_policy().requires_grad_(not warm)
         self.iteration, self.seconds = state["iteration"], state["seconds"]
+        self._renew(state["env"])
         self.history = json.loads(state["history"])
         torch.set_rng_state(state["torch_random"].cpu())
 
@@ -221,7 +296,7 @@ class Trainer:
             },
             provenance={
                 "terrain": config.terrain,
-                "samples": self.iteration * self.env.num_envs * config.steps,
+                "samples": self.samples,
                 "seed": config.seed,
                 "seconds": round(self.seconds, 1),
                 "config": comparable(config),
@@ -234,13 +309,14 @@ class Trainer:
 def comparable(config: TrainConfig) -> dict[str, Any]:
     """Return the settings that must not change between a run and its continuation."""
     values = dataclasses.asdict(config)
-    for name in ("out", "resume", "threads", "device"):
+    for name in ("out", "resume", "hours", "threads", "device"):
         del values[name]
     values["hidden"] = list(values["hidden"])
+    values["start_from"] = str(config.start_from) if config.start_from else None
     return values
 
 
-def training_world(config: TrainConfig) -> World:
+def training_world(config: TrainConfig, iteration: int = 0) -> World:
     """Lay out rows of rising difficulty, each with its own terrain variants.
 
     `general` takes the robot's specialties in turn, column by column. Seeds are even here, and odd
@@ -248,6 +324,8 @@ def training_world(config: TrainConfig) -> World:
     """
     names = SCALES[config.robot].mixed if config.terrain == "general" else (config.terrain,)
     levels = np.linspace(0.1, 1.0, config.rows) if config.rows > 1 else np.ones(1)
+    dice = np.random.default_rng((config.seed, iteration))
+    seeds = 2 * dice.integers(2**30, size=(config.rows, config.columns))
     return World(
         [
             [
@@ -255,7 +333,7 @@ def training_world(config: TrainConfig) -> World:
                     names[column % len(names)],
                     robot=config.robot,
                     difficulty=float(level),
-                    seed=2 * (config.seed * 10_000 + row * 100 + column),
+                    seed=int(seeds[row, column]),
                 )
                 for column in range(config.columns)
             ]
@@ -264,11 +342,11 @@ def training_world(config: TrainConfig) -> World:
     )
 
 
-def make_training_env(config: TrainConfig) -> LocomotionEnv:
-    """Build the robots on their training world."""
+def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
+    """Build the robots on the world in which training goes on from `iteration`."""
     make = env_class(config.robot)
     return make(
-        training_world(config),
+        training_world(config, iteration),
         config.num_envs,
         seed=config.seed,
         device=config.device,
@@ -280,7 +358,7 @@ def runner_config(config: TrainConfig, env: LocomotionEnv) -> dict[str, Any]:
     network = {"class_name": "MLPModel", "hidden_dims": list(config.hidden), "activation": "elu"}
     noise = {
         "class_name": "GaussianDistribution",
-        "init_std": config.initial_std,
+        "init_std": config.warm_std if config.start_from else config.initial_std,
         "std_type": "log",
         "std_range": (0.05, 2.0),
     }
@@ -327,6 +405,7 @@ def train(
     from torch.utils.tensorboard import SummaryWriter
 
     make_folder(config.folder)
+    began = time.monotonic()
     with (
         SummaryWriter(str(config.folder / "tensorboard")) as writer,
         tqdm(total=config.iterations, initial=trainer.iteration, unit="it") as bar,
@@ -345,7 +424,7 @@ def train(
                 on_iteration(row)
             if trainer.iteration % config.save_every == 0:
                 trainer.save()
-            if stopped():
+            if stopped() or (config.hours and time.monotonic() - began > 3600 * config.hours):
                 break
         if trainer.iteration % config.save_every:
             trainer.save()

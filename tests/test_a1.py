@@ -244,6 +244,9 @@ def test_stance_share_is_a_trot():
     share = a1_terms.stance_share(torch.tensor([0.0, 0.25, 0.75]))
     assert share[0].tolist() == pytest.approx([0.5] * 4, abs=1e-6)
     assert share[1].tolist() == pytest.approx([1, 0, 0, 1], abs=1e-6)
+    # Standing and swinging overlap for a little: 0.5 + 1.2 sin(2 pi / 36).
+    early = a1_terms.stance_share(torch.tensor([1 / 36]))[0, 0].item()
+    assert early == pytest.approx(0.5 + 1.2 * math.sin(math.radians(10)))
     assert share[2].tolist() == pytest.approx([0, 1, 1, 0], abs=1e-6)
 
 
@@ -263,7 +266,8 @@ def test_stance_share_is_a_trot():
 )
 def test_gait_by_hand(stance, force, slide, clearance, expected):
     four = [torch.full((1, 4), value) for value in (stance, force, slide, clearance)]
-    assert a1_terms.gait(*four, (0.04, 0.1)).item() == pytest.approx(expected, abs=1e-6)
+    value = a1_terms.gait(*four, (0.04, 0.1)).item()
+    assert value == pytest.approx(2 * expected - 1, abs=1e-6)
 
 
 def test_posture_limits_and_landing_by_hand():

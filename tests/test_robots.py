@@ -148,14 +148,40 @@ def test_leaving_the_tile_is_a_time_out_and_not_a_failure(robot):
 @robots
 def test_the_curriculum_follows_the_tracking_reward(robot):
     tiles = [[make_terrain("flat", robot=robot, seed=2)] for _ in range(3)]
-    env = env_class(robot)(World(tiles), 4, config=EnvConfig())
-    env.row = torch.tensor([1, 1, 1, 2])
+    env = env_class(robot)(World(tiles), 7, config=EnvConfig())
+    env.row = torch.tensor([1, 1, 1, 1, 1, 1, 2])
     env.episode_length_buf[:] = 10
-    env.return_r_v = torch.tensor([9.0, 9.0, 4.0, 9.0])
-    failed = torch.tensor([False, True, False, False])
-    env._promote(torch.arange(4), failed)
-    # Good: up. Failed: down. Middling: stays. Good on the last row: anywhere in the harder half.
-    assert env.row[:3].tolist() == [2, 0, 1] and env.row[3] >= 1
+    env.return_r_v = torch.tensor([9.0, 9.0, 9.0, 4.0, 9.0, 9.0, 9.0])
+    failed = torch.tensor([False, True, True, False, False, True, False])
+    way = torch.tensor([0.9, 0.2, 0.7, 0.9, 0.1, 0.2, 0.9])
+    env.begin[:] = env.motion()[0][:, :2]
+    env.begin[:, 0] -= way * env.tile_size[0]
+    env.crossing[:] = torch.arange(7) != 5
+    env._promote(torch.arange(7), failed)
+    # Tracked well: up. Failed early: down. Failed late, tracked badly, soon over, or failed but was
+    # not to cross the tile: stays. Tracked well on the last row: anywhere in the harder half.
+    assert env.row[:6].tolist() == [2, 0, 1, 1, 1, 1] and env.row[6] >= 1
+
+
+@robots
+def test_a_crossing_is_steered_along_the_lane_at_its_distance(robot):
+    terrain = make_terrain("bridge", robot=robot, difficulty=0.0, seed=3)
+    config = EnvConfig(train=False)
+    env = env_class(robot)(World([[terrain]]), 3, config=config)
+    beam = terrain.lane[1][1]
+    (x0, _), (x1, _) = terrain.lane[1:3]
+    corner = env.tile_corner(torch.arange(1))[0]
+    places = torch.tensor([[(x0 + x1) / 2, beam + side, 0.0] for side in (-0.1, 0.0, 0.1)])
+    places[:, :2] += corner
+    env.start(torch.arange(3), places, 0.5)
+    env.crossing[:], env.aside[:] = True, 0.0
+    env._steer()
+    rates = env.command[:, 2]
+    # To the right of the beam's line: turn left; on it: straight on; to its left: turn right.
+    assert rates[0] > 0.1 and abs(rates[1]) < 0.05 and rates[2] < -0.1
+    env.aside[:] = 0.1
+    env._steer()
+    assert abs(env.command[2, 2]) < 0.05
 
 
 def test_an_unknown_robot_lists_the_known_ones():

@@ -243,7 +243,8 @@ def test_bridge_by_measurement(robot: str, seed: int) -> None:
     region = terrain.elevation.crop(section.x0, section.y0, section.x1, section.y1)
     assert region.size[0] == pytest.approx(scale.bridge_length)
     beam = region.heights[0] == 0
-    assert (region.heights == np.where(beam, 0, -1)).all()
+    floor = np.float32(-scale.chasm_depth[-1])
+    assert (region.heights == np.where(beam, np.float32(0), floor)).all()
     assert beam.sum() * scale.resolution == pytest.approx(scale.bridge_width[1])
     (y,) = {point[1] for point in terrain.lane[1:-1]}
     assert y == pytest.approx(region.centres[1][beam].mean())
@@ -286,7 +287,7 @@ def test_resolution_and_scale_can_be_given() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"name": "lava"}, "flat, steps, gaps"),
+        ({"name": "lava"}, "flat, gentle, steps"),
         ({"robot": "spot"}, "a1, toy"),
         ({"difficulty": 1.1}, r"\[0, 1\]"),
         ({"difficulty": -0.1}, r"\[0, 1\]"),

@@ -11,7 +11,14 @@ import torch
 from fgtutor.errors import CheckpointError, ConfigError, StorageError
 from fgtutor.ppo import feasibility_labels
 from fgtutor.specialist import load_specialist
-from fgtutor.training import TrainConfig, Trainer, train, training_world
+from fgtutor.training import (
+    A1TrainConfig,
+    TrainConfig,
+    Trainer,
+    config_of,
+    train,
+    training_world,
+)
 
 TINY = {
     "num_envs": 4,
@@ -170,6 +177,68 @@ def test_a_checkpoint_of_another_run_is_refused(trained, change, message):
     config, _, _ = trained
     with pytest.raises(CheckpointError, match=message):
         train(TrainConfig(out=config.folder, resume=True, **TINY | change))
+
+
+def test_a_run_starts_from_a_trained_policy_with_a_critic_of_its_own(trained, tmp_path):
+    config, specialist, _ = trained
+    start = config.folder / "specialist"
+    settings = TINY | {"iterations": 3, "critic_warmup": 2, "warm_std": 0.125}
+    trainer = Trainer(TrainConfig(out=tmp_path / "run", start_from=start, **settings))
+    policy = trainer.algorithm.get_policy()
+
+    def weights():
+        return {k: v.clone() for k, v in policy.state_dict().items() if "distribution" not in k}
+
+    first = weights()
+    assert all(torch.equal(v, specialist.policy.state_dict()[k].cpu()) for k, v in first.items())
+    assert policy.distribution.log_std_param.exp().mean().item() == pytest.approx(0.125)
+    value = next(trainer.algorithm.critic.parameters()).clone()
+    trainer.iterate()
+    trainer.iterate()
+    assert all(torch.equal(v, first[k]) for k, v in weights().items())
+    assert not torch.equal(value, next(trainer.algorithm.critic.parameters()))
+    row = trainer.iterate()
+    assert any(not torch.equal(v, first[k]) for k, v in weights().items())
+    assert row["samples"] == specialist.provenance["samples"] + 3 * 4 * 8
+
+
+def test_starting_from_another_robots_policy_is_refused(trained, tmp_path):
+    start = trained[0].folder / "specialist"
+    with pytest.raises(CheckpointError, match="drives toy"):
+        Trainer(A1TrainConfig(out=tmp_path, start_from=start, num_envs=2, rows=1, columns=1))
+
+
+def test_a_time_budget_stops_a_run_that_can_be_resumed(tmp_path):
+    config = TrainConfig(out=tmp_path / "run", hours=1e-6, **TINY)
+    train(config)
+    trainer = Trainer(config)
+    trainer.resume()
+    assert 1 <= trainer.iteration < TINY["iterations"]
+
+
+def test_each_checkpoint_moves_to_new_ground_and_leaves_a_snapshot(trained):
+    config = trained[0]
+    worlds = [training_world(config, iteration) for iteration in (0, 0, 2)]
+    first, again, later = ([t.seed for row in world.tiles for t in row] for world in worlds)
+    assert first == again and not set(first) & set(later)
+    assert all(seed % 2 == 0 for seed in first + later)  # evaluation draws odd ones
+    snapshots = sorted(int(p.name) for p in (config.folder / "snapshots").iterdir())
+    assert snapshots == [2, 4, 6]
+    early = load_specialist(config.folder / "snapshots" / "2")
+    assert early.provenance["samples"] == 2 * 4 * 8
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ([], TrainConfig),
+        (["--terrain", "steps"], TrainConfig),
+        (["--robot", "a1"], A1TrainConfig),
+        (["--robot=a1", "--hours", "1"], A1TrainConfig),
+    ],
+)
+def test_the_command_line_takes_the_robots_own_sizes(words, expected):
+    assert config_of(words) is expected
 
 
 def test_a_checkpoint_of_another_robot_is_refused(trained, tmp_path):

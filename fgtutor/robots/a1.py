@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import grey_closing, maximum_filter
 from torch import Tensor
 
 from fgtutor.elevation import ElevationMap
@@ -55,10 +55,18 @@ MAX_TILT = 1.2
 """A trunk tilted further than this has fallen, rad."""
 DROP = 0.3
 """A sole this far below the ground around it has dropped into a hole, m."""
-RIM = 0.15
-"""How far around a foot the ground counts that it may have dropped from, m. On a wall of 50 degrees
-the ground rises by less than DROP within it."""
-A1_EPISODES = EnvConfig(speed=(0.45, 0.9), max_turn_rate=1.0, episode_seconds=20.0)
+RIM = 0.25
+"""Half of the widest hole that a foot can drop into while the robot still stands, m."""
+FREE_FALL = 2.0
+"""A trunk that sinks faster than this falls, m/s: a step of 0.2 m would do it, walking never."""
+A1_EPISODES = EnvConfig(
+    speed=(0.45, 0.9),
+    max_turn_rate=1.0,
+    episode_seconds=20.0,
+    stuck_seconds=2.5,
+    promote_above=0.4,
+    demote_below=0.15,
+)
 """The A1's commands; the time limit lets the slowest command cross a tile of 8 m."""
 
 
@@ -134,7 +142,10 @@ class A1Env(LocomotionEnv):
         ground = np.asarray(world.elevation.filled().heights)
         around = 2 * round(RIM / self.resolution) + 1
         self.peaks = torch.as_tensor(maximum_filter(ground, 3), device=device).flatten()
-        self.rims = torch.as_tensor(maximum_filter(ground, around), device=device).flatten()
+        # Closing, unlike a maximum, does not take the foot of a wall for the floor of a hole.
+        rims = grey_closing(np.pad(ground, around, mode="edge"), around)
+        rims = np.ascontiguousarray(rims[around:-around, around:-around])
+        self.rims = torch.as_tensor(rims, device=device).flatten()
         self.map_shape = ground.shape
         self.stance = torch.tensor(STANCE, device=device)
         self.look_points = LOOK_GRID.points.to(device)
@@ -350,7 +361,8 @@ class A1Env(LocomotionEnv):
         feet = self._feet("foot_position")
         rim = self._lookup(self.rims, feet[..., :2])
         dropped = (feet[..., 2] - FOOT_RADIUS < rim - DROP).any(dim=-1)
-        return touching | tipped | dropped | self.exploded.to(self.device)
+        falling = self.v[:, 2] < -FREE_FALL
+        return touching | tipped | dropped | falling | self.exploded.to(self.device)
 
     def drawing(self) -> Float[np.ndarray, "envs 19"]:
         """Return qpos: trunk position (world), trunk quaternion (w, x, y, z) and joint angles."""

@@ -21,7 +21,7 @@ from fgtutor.symmetry import Mirror
 
 SCAN_GRID = PatchGrid(ahead=0.9, behind=0.5, half_width=0.4)
 """What the policy sees: 15 x 9 points, mostly ahead."""
-SCAN_LIMIT = 0.6
+SCAN_LIMIT = 0.8
 """The scan ends this far above and below the trunk's centre, m."""
 NOISE = {
     "velocity": (3, 0.1, 2.0),
@@ -102,7 +102,7 @@ class RewardWeights:
     """Squared roll and pitch rate."""
     limits: float = -1.0
     """Joint angles beyond the soft limits, rad."""
-    jerk: float = -0.01
+    jerk: float = -0.02
     """Squared change of the action."""
     landing: float = -0.3
     """Foot forces beyond what a step needs."""
@@ -124,7 +124,7 @@ def stance_share(clock: Float[Tensor, "n"]) -> Float[Tensor, "n 4"]:
     The two blend into each other, so that the moment of touching down is the robot's to choose.
     """
     phase = clock[:, None] + torch.tensor(PAIR, device=clock.device)
-    return 0.5 + 0.5 * torch.sin(2 * math.pi * phase)
+    return (0.5 + 1.2 * torch.sin(2 * math.pi * phase)).clamp(0.0, 1.0)
 
 
 def gait(
@@ -134,7 +134,9 @@ def gait(
     clearance: Float[Tensor, "n 4"],
     corridor: tuple[float, float],
 ) -> Float[Tensor, "n"]:
-    """Return the mean over feet: stand loaded and without sliding, swing unloaded in the corridor.
+    """Return -1 to 1: stand loaded and without sliding, swing unloaded in the corridor.
+
+    Standing on all feet does half of it at any time and is worth 0.
 
     Args:
         stance: How much each foot should stand, from `stance_share`.
@@ -149,7 +151,7 @@ def gait(
     outside = (low - clearance).clamp(min=0.0) + (clearance - high).clamp(min=0.0)
     stand = load * kernel(slide, 0.1)
     swing = (1.0 - load) * kernel(outside, 0.03**2)
-    return (stance * stand + (1.0 - stance) * swing).mean(dim=-1)
+    return 2.0 * (stance * stand + (1.0 - stance) * swing).mean(dim=-1) - 1.0
 
 
 def posture(joints: Float[Tensor, "n 12"]) -> Float[Tensor, "n"]:

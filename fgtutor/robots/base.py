@@ -57,7 +57,8 @@ class EnvConfig:
     promote_above: float = 0.5
     """Mean r_v of an unfailed episode from which its robot moves to a harder row."""
     demote_below: float = 0.3
-    """Mean r_v of an episode below which its robot moves to an easier row; so does a failure."""
+    """Mean r_v of a crossing below which its robot moves to an easier row; so does a failure in the
+    tile's first half."""
     start_row: int = 0
     """Row on which training starts."""
     train: bool = True
@@ -121,7 +122,11 @@ class LocomotionEnv(VecEnv):
         self.command = torch.zeros(num_envs, 3, device=device)
         self.target_yaw = torch.zeros(num_envs, device=device)
         self.anchor = torch.zeros(num_envs, 2, device=device)
+        self.begin = torch.zeros(num_envs, 2, device=device)
         self.turning = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.crossing = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.aside = torch.zeros(num_envs, device=device)
+        self._lay_lanes()
         self.tracking = torch.zeros(num_envs, 3, device=device)
         self.return_r_v = torch.zeros(num_envs, device=device)
         self.stuck_from = torch.zeros(num_envs, 2, device=device)
@@ -194,7 +199,7 @@ class LocomotionEnv(VecEnv):
         if self.config.train:
             ids = done.nonzero().flatten()
             if len(ids):
-                self._promote(ids, failed)
+                self._promote(ids, failed[ids])
                 self.reset(ids)
             self._steer()
         return self.get_observations(), reward, done.long(), extras
@@ -217,11 +222,15 @@ class LocomotionEnv(VecEnv):
         """Begin new training episodes for `ids`: draw a pose, a heading and a speed."""
         n = len(ids)
         self.column[ids] = (self.column[ids] + 1) % self.num_columns
-        poses = self._draw_poses(ids)
+        poses, crossing = self._draw_poses(ids)
         low, high = self.config.speed
         speed = low + (high - low) * self._uniform(n)
-        self.turning[ids] = self._uniform(n) < self.config.turn_share
         self.start(ids, poses, speed)
+        self.turning[ids] = self._uniform(n) < self.config.turn_share
+        self.crossing[ids] = crossing
+        beside = poses[:, 1] - self.tile_corner(ids)[:, 1] - self._lane(ids, poses[:, 0])
+        spread = self.spreads[self.row[ids], self.column[ids]]
+        self.aside[ids] = torch.minimum(torch.maximum(beside, -spread), spread)
 
     @plain_tensors
     def start(self, ids: Tensor, poses: Float[Tensor, "n 3"], speed: Tensor | float) -> None:
@@ -232,7 +241,9 @@ class LocomotionEnv(VecEnv):
         self.stuck_steps[ids] = 0
         self.stuck_from[ids] = poses[:, :2]
         self.anchor[ids] = poses[:, :2]
+        self.begin[ids] = poses[:, :2]
         self.target_yaw[ids] = poses[:, 2]
+        self.crossing[ids] = False
         self.command[ids] = 0.0
         self.command[ids, 0] = speed
 
@@ -267,7 +278,24 @@ class LocomotionEnv(VecEnv):
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.random).to(self.device)
 
-    def _draw_poses(self, ids: Tensor) -> Float[Tensor, "n 3"]:
+    def _lay_lanes(self) -> None:
+        """Tabulate where, at every 0.1 m along each tile, its lane lies."""
+        x = np.arange(0.0, float(self.tile_size[0]) + 0.1, 0.1)
+        tiles = self.world.tiles
+        lanes = np.array(
+            [[np.interp(x, *np.array(sorted(t.lane)).T) for t in row] for row in tiles]
+        )
+        spreads = np.array([[tile.spread for tile in row] for row in tiles])
+        self.lanes = torch.as_tensor(lanes, dtype=torch.float32, device=self.device)
+        self.spreads = torch.as_tensor(spreads, dtype=torch.float32, device=self.device)
+
+    def _lane(self, ids: Tensor, x: Tensor) -> Tensor:
+        """Return how far to the left of its tile's corner each robot's lane lies at world x, m."""
+        row, column = self.row[ids], self.column[ids]
+        along = ((x - self.offsets[row, column, 0]) / 0.1).round().long()
+        return self.lanes[row, column, along.clamp(0, self.lanes.shape[-1] - 1)]
+
+    def _draw_poses(self, ids: Tensor) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
         """Draw poses: across the tile from one of its ends, or anywhere the ground is level."""
         n, tries = len(ids), 8
         corner = self.tile_corner(ids)
@@ -288,9 +316,10 @@ class LocomotionEnv(VecEnv):
         under = patch[..., self.grid.footprint_index]
         best = (under.amax(-1) - under.amin(-1)).argmin(dim=1)
         level = anywhere[torch.arange(n), best]
-        poses = torch.where((self._uniform(n) < self.config.traverse_share)[:, None], across, level)
+        crossing = self._uniform(n) < self.config.traverse_share
+        poses = torch.where(crossing[:, None], across, level)
         poses[:, 2] += 0.15 * (2 * self._uniform(n) - 1)
-        return poses
+        return poses, crossing
 
     def _steer(self) -> None:
         """Command the turn rate that keeps each robot on its line, as on a route."""
@@ -302,10 +331,18 @@ class LocomotionEnv(VecEnv):
                 turn, self.target_yaw + eighths * (math.pi / 4), self.target_yaw
             )
             self.anchor = torch.where(turn[:, None], pose[:, :2], self.anchor)
+            self.crossing &= ~turn
         along = torch.stack((torch.cos(self.target_yaw), torch.sin(self.target_yaw)), dim=-1)
         offset = pose[:, :2] - self.anchor
         aside = along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]
-        wanted = self.target_yaw - torch.atan2(aside, torch.tensor(0.6))
+        ahead = 0.6
+        wanted = self.target_yaw - torch.atan2(aside, torch.tensor(ahead))
+        if self.crossing.any():
+            everyone = torch.arange(self.num_envs, device=self.device)
+            forth = ahead * torch.sign(along[:, 0])
+            lane = self._lane(everyone, pose[:, 0] + forth) + self.aside
+            to_lane = lane + self.tile_corner(everyone)[:, 1] - pose[:, 1]
+            wanted = torch.where(self.crossing, torch.atan2(to_lane, forth), wanted)
         self.command[:, 2] = turn_rate(wanted, pose[:, 3], self.config.max_turn_rate)
 
     def _stuck(self, pose: Tensor) -> Bool[Tensor, "envs"]:
@@ -326,11 +363,14 @@ class LocomotionEnv(VecEnv):
     def _promote(self, ids: Tensor, failed: Tensor) -> None:
         """Move robots along the difficulty rows by the tracking reward of the episode just ended.
 
-        A robot that masters the last row is sent to a random one of the harder half.
+        Only crossings count against a robot: what other episodes ask for may be impossible. One
+        that masters the last row is sent to a random one of the harder half.
         """
         mean = self.return_r_v[ids] / self.episode_length_buf[ids].clamp(min=1)
-        up = (mean > self.config.promote_above) & ~failed[ids]
-        down = (mean < self.config.demote_below) | failed[ids]
+        way = (self.motion()[0][ids, :2] - self.begin[ids]).norm(dim=-1) / self.tile_size[0]
+        up = (mean > self.config.promote_above) & (way > 0.25) & ~failed
+        down = (mean < self.config.demote_below) | (failed & (way < 0.5))
+        down &= self.crossing[ids]
         row = self.row[ids] + up.long() - (down & ~up).long()
         half = self.num_rows // 2
         anywhere = half + torch.floor(self._uniform(len(ids)) * (self.num_rows - half)).long()
