@@ -1,6 +1,9 @@
 # Every target installs what it needs into .venv first; nothing outside this folder is touched.
 #   make demo       plan and drive a mixed terrain with the shipped toy specialists; writes demo/
 #   make test       every test          make test-fast  those that take under a minute together
+#   make lab        JupyterLab on the first notebook, on this machine only
+#   make notebooks  execute the notebooks' sources     make exercises  build them from their masters
+#   make test-wheel build the wheel and run notebooks 01 and 06 against it in a fresh environment
 #   make check      lint, types, imports
 #   make clean      remove what the targets made (.venv too)
 # PYTHON=/path/to/python chooses the interpreter for .venv (3.11 or newer).
@@ -10,17 +13,44 @@ BIN := $(VENV)/bin
 BASE := $(VENV)/.installed-base
 ALL := $(VENV)/.installed-all
 
-.PHONY: demo test test-fast check clean
+.PHONY: demo browser lab notebooks exercises test test-fast test-wheel check clean
 .DELETE_ON_ERROR:
 
 demo: $(BASE)
 	$(BIN)/fgtutor demo
 
-test: $(ALL)
+test: $(ALL) browser
 	$(BIN)/python -m pytest
 
 test-fast: $(ALL)
 	$(BIN)/python -m pytest -m "not slow"
+
+# One test moves a slider in a real browser. Installing one needs root; without, that test is skipped.
+browser:
+	@for name in chromium chromium-browser google-chrome google-chrome-stable; do \
+	  if command -v $$name >/dev/null; then exit 0; fi; done; \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	  echo "Installing Chromium"; apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium >/dev/null || \
+	  echo "Chromium could not be installed: the browser test will be skipped"; \
+	else echo "no Chromium and not root: the browser test will be skipped"; fi
+
+# The server asks for its token and listens on the loopback address only.
+lab: $(ALL)
+	$(BIN)/jupyter lab --ip=127.0.0.1 notebooks/01_elevation_maps.ipynb
+
+notebooks: $(ALL)
+	$(BIN)/fgtutor notebooks
+
+exercises: $(ALL)
+	$(BIN)/fgtutor exercises
+
+test-wheel: $(ALL)
+	rm -rf build/wheel && $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheel .
+	$(BIN)/python -m venv build/wheel/venv
+	build/wheel/venv/bin/python -m pip install --quiet --constraint constraints.txt \
+	  "$$(echo build/wheel/*.whl)[lab]"
+	cp -r notebooks build/wheel/notebooks
+	cd build/wheel && venv/bin/fgtutor notebooks --names 01 06
 
 check: $(ALL)
 	$(BIN)/ruff check

@@ -25,6 +25,21 @@ COMMANDS = {
         "CalibrationConfig",
         "compare every Feasibility-Net with what its policy does on new terrain",
     ),
+    "evaluate baselines": (
+        "evaluation.ablation",
+        "AblationConfig",
+        "say what each part of the method buys, beside classical planners",
+    ),
+    "evaluate adaptation": (
+        "evaluation.adaptation",
+        "AdaptationConfig",
+        "plan with early, mid and late checkpoints of one policy",
+    ),
+    "map": ("mapping", "MapConfig", "turn a point cloud into an elevation map"),
+    "export": ("export", "ExportConfig", "write a policy as ONNX, with what it observes"),
+    "notebooks": ("teach.notebooks", "NotebooksConfig", "execute the course's notebooks"),
+    "exercises": ("teach.courseware", "ExercisesConfig", "build the exercises from their masters"),
+    "grade": ("teach.grading", "GradeConfig", "grade one exercise notebook or a whole class"),
     "doctor": ("doctor", "DoctorConfig", "say what this machine has, lacks and needs"),
 }
 """Command: module under fgtutor, its config dataclass (or what picks it), what it is for."""

@@ -59,3 +59,31 @@ class InfeasibleCellError(PlanningError):
 
 class UnreachableError(PlanningError):
     """Start and goal are both usable, but no chain of feasible edges joins them."""
+
+
+class RenderingError(FgtutorError):
+    """MuJoCo cannot draw on this machine: no graphics library works, or it gave up on the way."""
+
+
+class NotebookError(FgtutorError):
+    """A notebook of the course could not be built from its source."""
+
+
+class CloudError(FgtutorError):
+    """A point cloud, or a file that should hold one, is not usable."""
+
+
+class MissingExtraError(FgtutorError):
+    """Something optional was asked for whose package is not installed."""
+
+
+class EvaluationError(FgtutorError):
+    """A task of an evaluation failed, or took its worker down each time it was tried."""
+
+
+class ReportError(FgtutorError):
+    """A report folder holds another run's results, or not yet all of this one's."""
+
+
+class ExportError(FgtutorError):
+    """An exported network does not answer as the policy it was made from."""

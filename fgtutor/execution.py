@@ -128,7 +128,12 @@ def execute_batch(
             "route with the zoo that it was planned with"
         )
     robot = env_class(robots.pop())
-    episodes = replace(robot.episodes, train=False, stuck_seconds=math.inf)
+    episodes = replace(
+        robot.episodes,
+        train=False,
+        stuck_seconds=math.inf,
+        history=max(specialist.history for specialist in specialists),
+    )
     env = robot(World([list(terrains)]), len(routes), config=episodes)
     return _Drive(env, routes, specialists, seeds, settings).run(record_body, progress)
 

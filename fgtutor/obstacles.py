@@ -83,7 +83,7 @@ SCALES = {
         resolution=0.1,
         length=9.0,
         chasm_depth=(0.05, 0.5, 1.0),
-        step_height=(0.06, 0.16),
+        step_height=(0.06, 0.15),
         # A toy drives in a slice: what differs beside it would only blur what its terrains are.
         block_share=0.0,
         lane_share=0.0,
@@ -95,7 +95,7 @@ SCALES = {
         slope_height=0.7,
         stair_rise=0.16,
         stair_run=0.4,
-        rubble_height=0.12,
+        rubble_height=0.1,
         rubble_size=(0.1, 0.2),
         rubble_density=0.3,
         mixed=("steps", "gaps", "slopes", "rubble"),
@@ -349,7 +349,8 @@ def _gentle(course: Course, x0: float, x1: float) -> float:
     """Lay low blocks along the way, and pits and walls beside it, seen but never stepped on."""
     columns = course.cuts(x1 - x0, 0.7, 1.4)
     for near, far in pairwise(columns):
-        right, left = (course.snap(course.middle + side * course.draw(0.45, 1.0)) for side in (-1, 1))
+        right = course.snap(course.middle - course.draw(0.45, 1.0))
+        left = course.snap(course.middle + course.draw(0.45, 1.0))
         top = course.dice.uniform(0.0, 0.05) * course.severity
         course.block(x0 + near, x0 + far, right, left, top)
         for y0, y1 in ((0.0, right), (left, course.width)):

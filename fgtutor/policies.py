@@ -14,10 +14,15 @@ from rsl_rl.utils import resolve_nn_activation
 from tensordict import TensorDict
 from torch import nn
 
+from fgtutor.dreamwaq import DreamWaQModel
 from fgtutor.errors import SpecialistError
 from fgtutor.symmetry import SymmetricMLPModel
 
-POLICIES: dict[str, type[MLPModel]] = {"mlp": MLPModel, "symmetric": SymmetricMLPModel}
+POLICIES: dict[str, type[MLPModel]] = {
+    "mlp": MLPModel,
+    "symmetric": SymmetricMLPModel,
+    "dreamwaq": DreamWaQModel,
+}
 """Policy classes that a folder may name; `register_policy` adds one."""
 _DISTRIBUTION_OPTIONS = ("std_type", "std_range")
 _ACTIVATIONS = ("elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu")

@@ -1,7 +1,8 @@
 """PPO that fits the Feasibility-Net on the way: one rollout, two losses, no shared weight.
 
 Reads rsl_rl's rollout storage, whose `tracking` group tells what happened after every step; gives
-labels for each patch and an algorithm that trains policy and Feasibility-Net side by side.
+labels for each patch and an algorithm that trains policy and Feasibility-Net side by side, and the
+context encoder of a blind policy.
 Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
 """
 
@@ -11,8 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from rsl_rl.algorithms import PPO
 from rsl_rl.utils import reduce_gradients_in_buckets
-from torch import Tensor
+from torch import Tensor, nn
 
+from fgtutor.dreamwaq import ContextNet, DreamWaQModel
 from fgtutor.feasibility import FeasibilityNet
 
 QUANTILES = (0.5, 0.9, 0.95, 0.99)
@@ -52,7 +54,8 @@ def feasibility_labels(
 class FeasibilityPPO(PPO):
     """rsl_rl's PPO that also fits the Feasibility-Net to each rollout before it learns from it.
 
-    The two share data and nothing else: separate networks, optimisers and losses.
+    The two share data and nothing else: separate networks, optimisers and losses. A blind policy's
+    context encoder is fitted in the same way, to its own loss.
     """
 
     def __init__(
@@ -62,6 +65,9 @@ class FeasibilityPPO(PPO):
         feasibility_learning_rate: float,
         feasibility_batch: int,
         feasibility_updates: int,
+        context_learning_rate: float,
+        context_batch: int,
+        context_updates: int,
         **kwargs: Any,
     ) -> None:
         """Add a Feasibility-Net sized by the `patch` group to what PPO builds."""
@@ -73,11 +79,21 @@ class FeasibilityPPO(PPO):
         )
         self.label_steps = label_steps
         self.feasibility_batch, self.feasibility_updates = feasibility_batch, feasibility_updates
+        policy = self.get_policy()
+        self.context = policy.context if isinstance(policy, DreamWaQModel) else None
+        if self.context:
+            self.context_optimizer = torch.optim.Adam(
+                self.context.parameters(), lr=context_learning_rate
+            )
+        self.context_batch, self.context_updates = context_batch, context_updates
         self.metrics: dict[str, float] = {}
         self.memory: list[tuple[Tensor, Tensor, Tensor]] = []
 
     def update(self) -> dict[str, float]:
-        """Fit the Feasibility-Net, then update the policy (which empties the storage)."""
+        """Fit the Feasibility-Net, then update the policy (which empties the storage).
+
+        The context encoder comes last: what PPO compares are policies on the same context.
+        """
         tracking = self.storage.observations["tracking"]
         self.metrics = {
             "reward": self.storage.rewards.mean().item(),
@@ -85,8 +101,25 @@ class FeasibilityPPO(PPO):
             "failed": tracking[..., 1].sum().item() / max(1.0, tracking[..., 2].sum().item()),
         }
         self.metrics |= self.fit_feasibility()
+        samples = self.context.samples(self.storage.observations) if self.context else None
         self.metrics |= super().update()
+        # While only the critic learns, nothing of the policy may change.
+        if self.context and samples and next(self.context.parameters()).requires_grad:
+            self.metrics |= self.fit_context(self.context, *samples)
         return self.metrics
+
+    def fit_context(
+        self, context: ContextNet, history: Tensor, velocity: Tensor, following: Tensor
+    ) -> dict[str, float]:
+        """Fit the context encoder to the samples of one rollout; return the mean loss parts."""
+        sums: dict[str, float] = {}
+        shape = (self.context_updates, self.context_batch)
+        for batch in torch.randint(len(history), shape, device=history.device):
+            loss, parts = context.loss(history[batch], velocity[batch], following[batch])
+            self._descend(loss, context, self.context_optimizer)
+            for name, value in parts.items():
+                sums[name] = sums.get(name, 0.0) + value.item() / self.context_updates
+        return {f"context_{name}": value for name, value in sums.items()}
 
     def fit_feasibility(self) -> dict[str, float]:
         """Fit the net to the labelled patches at hand; return the mean of each loss part.
@@ -105,13 +138,7 @@ class FeasibilityPPO(PPO):
         batches = torch.randint(len(label), shape, device=label.device)
         for batch in batches:
             loss, parts = self.feasibility.loss(patch[batch], command[batch], label[batch])
-            self.feasibility_optimizer.zero_grad()
-            loss.backward()
-            if self.is_multi_gpu:
-                reduce_gradients_in_buckets(
-                    self.feasibility.parameters(), self.gpu_world_size, self.grad_reduce_bucket_mb
-                )
-            self.feasibility_optimizer.step()
+            self._descend(loss, self.feasibility, self.feasibility_optimizer)
             for name, value in parts.items():
                 sums[name] = sums.get(name, 0.0) + value.item() / len(batches)
         with torch.no_grad():
@@ -122,6 +149,16 @@ class FeasibilityPPO(PPO):
         losses = {f"feasibility_{name}": value for name, value in sums.items()}
         return losses | {f"L_recon_{q}": v for q, v in zip(QUANTILES, quantiles, strict=True)}
 
+    def _descend(self, loss: Tensor, net: nn.Module, optimizer: torch.optim.Optimizer) -> None:
+        """Take one step down the loss, along the mean gradient of all processes."""
+        optimizer.zero_grad()
+        loss.backward()
+        if self.is_multi_gpu:
+            reduce_gradients_in_buckets(
+                net.parameters(), self.gpu_world_size, self.grad_reduce_bucket_mb
+            )
+        optimizer.step()
+
     def broadcast_parameters(self) -> None:
         """Copy all networks from the first process to the others."""
         super().broadcast_parameters()
@@ -130,13 +167,18 @@ class FeasibilityPPO(PPO):
 
     def save(self) -> dict:
         """Return the state of all networks and optimisers."""
-        return super().save() | {
+        state = super().save() | {
             "feasibility_state_dict": self.feasibility.state_dict(),
             "feasibility_optimizer_state_dict": self.feasibility_optimizer.state_dict(),
         }
+        if self.context:
+            state["context_optimizer_state_dict"] = self.context_optimizer.state_dict()
+        return state
 
     def load(self, loaded_dict: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
         """Take over the state that `save` returned."""
         self.feasibility.load_state_dict(loaded_dict["feasibility_state_dict"], strict=strict)
         self.feasibility_optimizer.load_state_dict(loaded_dict["feasibility_optimizer_state_dict"])
+        if self.context:
+            self.context_optimizer.load_state_dict(loaded_dict["context_optimizer_state_dict"])
         return super().load(loaded_dict, load_cfg, strict)

@@ -86,6 +86,11 @@ class Specialist:
         terrain = self.provenance.get("terrain", "unknown terrain")
         return f"Specialist({self.name!r} for {self.robot}, trained on {terrain})"
 
+    @property
+    def history(self) -> int:
+        """How many frames of history its policy reads; 0 unless it is blind (`dreamwaq`)."""
+        return getattr(self.policy, "history", 0)
+
     @torch.no_grad()
     def act(self, observations: TensorDict) -> Tensor:
         """Return the policy's deterministic actions [robots, actions].

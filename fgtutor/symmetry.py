@@ -5,8 +5,9 @@ the mirrored answer. Source: network symmetry in Abdolhosseini et al., "On Learn
 Locomotion", MIG 2019.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import torch
 from jaxtyping import Float
@@ -45,6 +46,33 @@ class Mirror:
                     f"the mirrored {what} mirrored again must be the {what} itself: pair every "
                     f"index with the one it names and use signs +1 or -1, got {index} and {sign}"
                 )
+
+    def part(self, keep: Sequence[int]) -> Self:
+        """Return the mirror of observations that hold only the numbers `keep`, in that order.
+
+        Raises `ConfigError` if a number is kept without its mirror image.
+        """
+        place = {old: new for new, old in enumerate(keep)}
+        alone = [i for i in keep if self.observation_index[i] not in place]
+        if alone:
+            raise ConfigError(f"numbers {alone} are kept without their mirror images: keep both")
+        return replace(
+            self,
+            observation_index=tuple(place[self.observation_index[i]] for i in keep),
+            observation_sign=tuple(self.observation_sign[i] for i in keep),
+        )
+
+
+def join(
+    parts: Iterable[tuple[Sequence[int], Sequence[float]]],
+) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Return index and sign of vectors that stand one after another, from those of each."""
+    index: list[int] = []
+    sign: list[float] = []
+    for part, signs in parts:
+        index += [len(sign) + i for i in part]
+        sign += [float(s) for s in signs]
+    return tuple(index), tuple(sign)
 
 
 class SymmetricMLP(MLP):

@@ -13,7 +13,7 @@ from fgtutor.robots import a1_terms
 from fgtutor.robots.a1 import A1_EPISODES, A1_GRID, A1Env, A1EnvConfig
 from fgtutor.robots.a1_model import JOINT_RANGES, STANCE
 from fgtutor.symmetry import SymmetricMLPModel
-from fgtutor.terrain import Terrain, World, make_terrain
+from fgtutor.terrain import SCALES, Terrain, World, make_terrain
 
 STILL = dataclasses.replace(A1_EPISODES, train=False, stuck_seconds=math.inf)
 FLAT = make_terrain("flat", robot="a1")
@@ -170,11 +170,18 @@ def test_scan_sees_a_ledge_ahead_at_its_height_over_the_trunk():
 
 
 def test_scan_is_clamped_and_blind_to_how_deep_a_hole_is():
-    terrain = make_terrain("gaps", robot="a1", difficulty=1.0, seed=1)
-    env = make(terrain, n=20)
-    put(env, *[(0.5 + 0.35 * i, 2.0, 0.0) for i in range(20)])
+    scans = []
+    for depth in (0.6, 1.5):
+        scale = dataclasses.replace(SCALES["a1"], chasm_depth=(depth, depth, depth))
+        terrain = make_terrain("gaps", robot="a1", difficulty=1.0, seed=1, scale=scale)
+        env = make(terrain, n=20)
+        put(env, *[(0.5 + 0.05 * i, 2.0, 0.0) for i in range(20)])
+        scans.append(env.get_observations()["policy"][:, -135:])
+    assert scans[0].min() < -0.5 and torch.allclose(*scans, atol=1e-5)
+    env = make(make_terrain("bridge", robot="a1", difficulty=1.0, seed=1), n=1)
+    put(env, (2.0, 2.375, 0.0))  # 0.3 m before the beam
     scan = env.get_observations()["policy"][:, -135:]
-    assert scan.min().item() == pytest.approx(3 * (0.29 - 0.6), abs=1e-5)
+    assert scan.min().item() == pytest.approx(3 * (0.29 - 0.8), abs=1e-5)
 
 
 def mirrored(observations):

@@ -11,9 +11,11 @@ from fgtutor.specialist import save_specialist
 
 @pytest.fixture
 def config(make_rolling, tmp_path):
-    """Two toys that only roll and predict f = 0.8 wherever they are."""
+    """Two toys that only roll and predict f = 0.95 wherever they are."""
     for name in ("flat", "gaps"):
-        save_specialist(make_rolling(name, provenance={"terrain": name}), tmp_path / "zoo" / name)
+        save_specialist(
+            make_rolling(name, f=0.95, provenance={"terrain": name}), tmp_path / "zoo" / name
+        )
     return CalibrationConfig(envs=4, seconds=4.0, zoo=tmp_path / "zoo", taus="paper")
 
 

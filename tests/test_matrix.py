@@ -1,20 +1,27 @@
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
+import numpy as np
 import pytest
 
-from fgtutor.errors import ConfigError, StorageError, TerrainError
-from fgtutor.evaluation.matrix import (
-    MatrixConfig,
-    Trial,
-    evaluate,
-    policies,
-    run,
+from fgtutor.baselines import ours
+from fgtutor.errors import ConfigError, ReportError, StorageError, TerrainError
+from fgtutor.evaluation import ablation, success
+from fgtutor.evaluation.ablation import AblationConfig
+from fgtutor.evaluation.cost import Cost
+from fgtutor.evaluation.matrix import MatrixConfig, evaluate, policies, run, table
+from fgtutor.evaluation.shards import collect
+from fgtutor.evaluation.success import (
+    make_ground,
+    make_tasks,
     summarise,
-    table,
     terrain_seed,
+    with_random_ends,
 )
+from fgtutor.evaluation.trials import Ground, Trial, drive
+from fgtutor.execution import FollowConfig
 from fgtutor.specialist import save_specialist
+from fgtutor.terrain import make_terrain
 
 
 @pytest.fixture
@@ -40,6 +47,7 @@ def test_rows_name_every_outcome(config):
         for policy in ("gaps", "steps", "ours", "general")
     ]
     for row in rows.values():
+        assert list(row) == ["terrain", "policy", "trials", "successes", "ci95", "failures"]
         assert row["trials"] == 3 == row["successes"] + sum(row["failures"].values())
         assert set(row["failures"]) == {"no_route", "fell", "timeout"}
         assert 0 <= row["ci95"][0] <= row["successes"] / 3 <= row["ci95"][1] <= 1
@@ -49,26 +57,79 @@ def test_rows_name_every_outcome(config):
     # A rolling toy that believes in itself drops an axle into the first gap, and hangs there.
     assert rows["gaps", "steps"]["successes"] == 0
     assert rows["gaps", "steps"]["failures"]["no_route"] == 0
+    # A part of the table is that part of the whole.
+    part = evaluate(replace(config, terrains=("flat",), policies=("ours",)))
+    assert part == [rows["flat", "ours"]]
 
 
+@pytest.mark.slow
 def test_the_number_of_workers_changes_nothing(config, monkeypatch):
-    monkeypatch.setattr("fgtutor.evaluation.matrix.BATCH", 2)
-    alone = evaluate(replace(config, terrains=("gaps",)))
-    assert evaluate(replace(config, terrains=("gaps",), workers=2)) == alone
+    monkeypatch.setattr(success, "GROUNDS", 2)
+    tasks = make_tasks(config, ("flat",), ("ours",))
+    alone, together = (
+        collect(tasks, {}, replace(config, workers=workers)).rows for workers in (1, 2)
+    )
+    assert len(alone) == 3 and alone == together  # every length, to the millimetre
 
 
-def test_a_part_of_the_table_equals_that_part_of_the_whole(config):
-    whole = {(row["terrain"], row["policy"]): row for row in evaluate(config)}
-    part = evaluate(replace(config, terrains=("gaps",), policies=("ours",)))
-    assert part == [whole["gaps", "ours"]]
+@pytest.mark.slow
+def test_parts_merge_to_the_same_table(config, monkeypatch):
+    monkeypatch.setattr(success, "GROUNDS", 1)
+    config = replace(config, trials=2, terrains=("flat",), policies=("steps",))
+    whole = evaluate(config)
+    parts = [replace(config, out=config.zoo.parent / f"part{k}", part=(k, 2)) for k in (1, 2)]
+    for part in parts:
+        with pytest.raises(ReportError, match=r"1 of 2 tasks done.*merge"):
+            evaluate(part)
+    merged = replace(config, merge=tuple(part.out for part in parts))
+    drawn = []
+    monkeypatch.setattr(success, "make_ground", lambda *which: drawn.append(which))
+    assert evaluate(merged) == whole and not drawn  # nothing is driven again
+    with pytest.raises(ReportError, match=r"f_min was 0\.1 and is 0\.2"):
+        evaluate(replace(merged, f_min=0.2))
+    # Another zoo is another run, wherever it lies.
+    description = config.zoo / "steps" / "specialist.json"
+    description.write_text(description.read_text() + "\n")
+    with pytest.raises(ReportError, match="zoo was"):
+        evaluate(merged)
 
 
-def test_the_command_writes_rows_and_prints_a_table(config, capsys):
-    assert run(replace(config, terrains=("flat",))) == 0
+def test_the_command_writes_rows_and_a_report_and_prints_a_table(config, capsys):
+    folder = config.zoo.parent / "report"
+    config = replace(config, terrains=("flat",), out=folder)
+    assert run(config) == 0
     rows = json.loads(config.json.read_text())
     assert [row["policy"] for row in rows] == ["gaps", "steps", "ours", "general"]
     printed = capsys.readouterr().out
-    assert "| flat | 0.0 | 100.0 | 100.0 | 100.0 |" in printed and "3 trials a cell" in printed
+    line = "| flat | 0 (0-56) | 100 (44-100) | 100 (44-100) | 100 (44-100) |"
+    assert line in printed and "3 trials a cell" in printed
+    # Three maps for each of three policies of the zoo, three episodes for each of four columns.
+    assert "1 of 1 tasks to do" in printed and "9 maps" in printed and "12 episodes" in printed
+    assert "on 1 core like this one" in printed
+
+    trials = json.loads((folder / "rows.json").read_text())
+    assert len(trials) == 12 and trials[0].keys() == asdict(Trial(**trials[0])).keys()
+    reached = [trial for trial in trials if trial["outcome"] == "reached"]
+    assert len(reached) == 9 and all(trial["length"] > 5 for trial in reached)
+    assert (
+        line in (folder / "table.md").read_text()
+        and "12 trials in all" in (folder / "table.md").read_text()
+    )
+    assert (folder / "figures" / "success.svg").read_text().count("<circle") == 4
+    # The second time everything is there: nothing to estimate, the same table.
+    assert run(config) == 0
+    again = capsys.readouterr().out
+    assert line in again and "tasks to do" not in again
+
+
+def test_a_part_says_how_to_get_the_table(config, capsys, monkeypatch):
+    monkeypatch.setattr(success, "GROUNDS", 2)
+    part = replace(
+        config, terrains=("flat",), policies=("gaps",), out=config.zoo.parent / "a", part=(2, 2)
+    )
+    assert run(part) == 0
+    assert "1 of 2 tasks done" in (printed := capsys.readouterr().out) and "--merge" in printed
+    assert not (part.out / "table.md").exists()
 
 
 def test_evaluation_never_draws_a_training_seed():
@@ -76,25 +137,88 @@ def test_evaluation_never_draws_a_training_seed():
     assert len(seeds) == 1500 and all(seed % 2 == 1 for seed in seeds)
 
 
+def test_the_papers_protocol_is_300_000_trials(config):
+    config = MatrixConfig(protocol="paper", robot="a1")
+    assert config.count == 10_000 and config.grounds == 40
+    six = ("bridge", "gaps", "steps", "valley", "ours", "general")
+    terrains = ("steps", "gaps", "bridge", "valley", "mixed")
+    tasks = make_tasks(config, terrains, six)
+    assert len(tasks) == len({task.name for task in tasks}) == 200
+    # Task k of a terrain is ground k; trial t is driven on ground t mod 40.
+    *_, grounds = tasks[41].arguments
+    assert list(grounds) == [1]
+    ground = make_ground(config, "gaps", 1)
+    assert len(ground.seeds) == 250 and ground.seeds[:2] == (
+        terrain_seed(0, 1),
+        terrain_seed(0, 41),
+    )
+    assert 250 * len(six) * len(tasks) == 300_000
+    few = make_ground(replace(config, trials=90), "gaps", 1)
+    assert few.seeds == ground.seeds[:3] and few.terrain.start == ground.terrain.start
+    assert replace(config, trials=7).grounds == 7
+
+
+@pytest.mark.parametrize("robot", ["toy", "a1"])
+def test_random_tasks_cross_the_obstacle_from_flat_ground_to_flat_ground(robot):
+    terrain = make_terrain("bridge" if robot == "a1" else "gaps", robot=robot, seed=5)
+    part, (_, _, length, width) = terrain.sections[0], terrain.elevation.extent
+    drawn = [with_random_ends(terrain, seed) for seed in range(40)]
+    assert len({task.start for task in drawn}) == 40
+    forwards = [task.start[0] < task.goal[0] for task in drawn]
+    assert 8 < sum(forwards) < 32
+    for task in drawn:
+        (left, a), (right, b) = sorted((task.start, task.goal))
+        assert 0.3 < left < part.x0 - 0.3 and part.x1 + 0.3 < right < length - 0.3
+        for x, y in ((left, a), (right, b)):
+            assert 0.5 <= y <= width - 0.5
+            around = terrain.elevation.crop(x - 0.3, y - 0.3, x + 0.3, y + 0.3).heights
+            assert np.ptp(around) < 1e-3
+    assert with_random_ends(terrain, 3).start == drawn[3].start
+
+
+def test_the_mixed_terrain_keeps_its_start_and_goal():
+    config = MatrixConfig(protocol="paper")
+    ground = make_ground(config, "mixed", 2).terrain
+    made = make_terrain("mixed", robot="toy", seed=ground.seed)
+    assert (ground.start, ground.goal) == (made.start, made.goal)
+
+
+def test_planning_may_see_another_map_than_the_truth(make_rolling):
+    truth, other = (make_terrain(name, robot="toy", seed=1) for name in ("flat", "gaps"))
+    zoo = {"steps": make_rolling("steps")}
+    misled = Ground(terrain=other, seeds=(1, 2), seen=truth.elevation)
+    trials = drive([misled], {"ours": ours}, zoo, follow=FollowConfig(patience=0.0, grace=1.0))
+    assert [trial.outcome for trial in trials] == ["timeout", "timeout"]  # after one second
+    assert [trial.seed for trial in trials] == [1, 2] and trials[0].seconds == pytest.approx(1.0)
+
+
 def test_summary_by_hand():
     outcomes = ("reached", "reached", "fell", "no_route")
-    row = summarise(
-        [Trial(terrain="t", policy="p", seed=i, outcome=o) for i, o in enumerate(outcomes)]
-    )
+    trials = [
+        asdict(Trial(terrain="t", policy="p", ground=1, seed=i, outcome=outcome))
+        for i, outcome in enumerate(outcomes)
+    ]
+    row = summarise(trials)
     assert row["successes"] == 2 and row["failures"] == {"no_route": 1, "fell": 1, "timeout": 0}
     assert row["ci95"] == pytest.approx([0.15, 0.85], abs=0.005)  # Wilson's interval for 2 of 4
-    assert table([row]) == "| terrain | p |\n|---|---|\n| t | 50.0 |"
+    assert table(trials) == "| terrain | p |\n| --- | --- |\n| t | 50 (15-85) |"
+
+
+def test_cost_by_hand():
+    cost = Cost(maps=1000, episodes=300_000, seconds=36_000)
+    assert "1,000 maps" in cost.on(4) and "2.5 h on 4 cores" in cost.on(4)
+    assert "37.5 min on 16 cores" in cost.on(16)
 
 
 def test_wrong_names_are_refused_before_anything_runs(config):
-    with pytest.raises(TerrainError, match="moon"):
-        evaluate(replace(config, terrains=("moon",)))
     with pytest.raises(TerrainError, match="moon"):
         evaluate(replace(config, terrains=("flat", "moon")))
     with pytest.raises(ConfigError, match="wings"):
         evaluate(replace(config, policies=("wings",)))
     with pytest.raises(ConfigError, match="trials"):
         MatrixConfig(trials=0)
+    with pytest.raises(ConfigError, match="planner named wings"):
+        ablation.evaluate(AblationConfig(planners=("wings",), zoo=config.zoo))
 
 
 def test_policies_come_in_the_tables_order(config, make_rolling):
@@ -107,3 +231,20 @@ def test_rows_that_cannot_be_written_are_reported_before_the_work(config):
     (config.zoo.parent / "file").write_text("in the way")
     with pytest.raises(StorageError, match="file"):
         run(replace(config, json=config.zoo.parent / "file" / "rows.json"))
+
+
+@pytest.mark.slow
+def test_the_ablation_has_a_line_a_planner(zoo, capsys):
+    config = AblationConfig(trials=2, terrain="flat", zoo=zoo, workers=1, out=zoo.parent / "report")
+    assert ablation.run(config) == 0
+    printed = capsys.readouterr().out
+    lines = [line.split(" | ")[0][2:] for line in printed.splitlines() if line.startswith("| ")]
+    assert lines == [
+        "planner", "---", "gaps", "steps", "ours", "general", "no-ood", "no-heading", "no-fusion",
+        "traversability", "traversability+P", "occupancy", "occupancy+P",
+    ]  # fmt: skip
+    # gaps refuses (f = 0.05 < f_min); all others find flat ground easy, with nothing to switch to.
+    assert "| gaps | 0 (0-66) | 2 | 0 | 0 | - | - |" in printed
+    rows = {row["policy"]: row for row in ablation.evaluate(config)}  # from the folder
+    assert [rows[name]["successes"] for name in ("ours", "no-fusion", "occupancy+P")] == [2, 2, 2]
+    assert "22 trials in all" in (config.out / "table.md").read_text()

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from fgtutor.errors import ConfigError
 from fgtutor.policies import register_policy
 from fgtutor.specialist import load_specialist, save_specialist
-from fgtutor.symmetry import Mirror, SymmetricMLP, SymmetricMLPModel
+from fgtutor.symmetry import Mirror, SymmetricMLP, SymmetricMLPModel, join
 
 MIRROR = Mirror(
     observation_index=(1, 0, 2, 3),
@@ -100,6 +100,28 @@ def test_a_mirror_that_is_none_is_refused(wrong):
     }
     with pytest.raises(ConfigError, match="mirrored again"):
         Mirror(**(fields | wrong))
+
+
+def test_vectors_are_joined_by_hand():
+    # A vector (x, y) beside a pair (left, right) whose signs flip.
+    index, sign = join([((0, 1), (1, -1)), ((1, 0), (-1, -1))])
+    assert index == (0, 1, 3, 2)
+    assert sign == (1.0, -1.0, -1.0, -1.0)
+
+
+def test_a_part_of_a_mirror_by_hand():
+    part = MIRROR.part((3, 1, 0))
+    assert part.observation_index == (0, 2, 1)
+    assert part.observation_sign == tuple(MIRROR.observation_sign[i] for i in (3, 1, 0))
+    assert (part.action_index, part.action_sign) == (MIRROR.action_index, MIRROR.action_sign)
+    x = torch.randn(7, 4)
+    image = x[:, [3, 1, 0]][:, list(part.observation_index)] * torch.tensor(part.observation_sign)
+    assert torch.equal(image, mirrored(x)[:, [3, 1, 0]])
+
+
+def test_a_part_without_its_mirror_image_is_refused():
+    with pytest.raises(ConfigError, match=r"numbers \[1\] are kept without their mirror images"):
+        MIRROR.part((1, 2))
 
 
 def test_a_mirror_of_another_robot_is_refused():

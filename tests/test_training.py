@@ -241,6 +241,19 @@ def test_the_command_line_takes_the_robots_own_sizes(words, expected):
     assert config_of(words) is expected
 
 
+def test_a_checkpoint_older_than_a_setting_is_taken_up(trained, tmp_path):
+    config, specialist, _ = trained
+    state = torch.load(config.folder / "checkpoint.pt", weights_only=True)
+    settings = json.loads(state["config"])
+    young = ("actor", "context_learning_rate", "context_batch", "context_updates")
+    state["config"] = json.dumps({k: v for k, v in settings.items() if k not in young})
+    torch.save(state, tmp_path / "checkpoint.pt")
+    again = train(TrainConfig(out=tmp_path, resume=True, **TINY))
+    assert again.provenance["samples"] == specialist.provenance["samples"]
+    with pytest.raises(CheckpointError, match="actor was 'perceptive', now 'dreamwaq'"):
+        train(TrainConfig(out=tmp_path, resume=True, actor="dreamwaq", **TINY))
+
+
 def test_a_checkpoint_of_another_robot_is_refused(trained, tmp_path):
     config, _, _ = trained
     state = torch.load(config.folder / "checkpoint.pt", weights_only=True)

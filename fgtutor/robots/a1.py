@@ -11,7 +11,7 @@ policy that trains on two CPU cores, adds a gait clock and left-right symmetry.
 
 import math
 import warnings
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 
 import mujoco
 import numpy as np
@@ -23,6 +23,7 @@ from torch import Tensor
 from fgtutor.elevation import ElevationMap
 from fgtutor.patches import PatchGrid, ground_height, rotate, sample_heights
 from fgtutor.robots import a1_terms
+from fgtutor.robots.a1_bodies import A1EnvConfig, randomise
 from fgtutor.robots.a1_model import (
     FOOT_RADIUS,
     STANCE,
@@ -37,7 +38,6 @@ from fgtutor.robots.a1_terms import (
     SCAN_LIMIT,
     SCAN_NOISE,
     SCAN_SCALE,
-    RewardWeights,
 )
 from fgtutor.robots.base import EnvConfig, LocomotionEnv
 from fgtutor.robots.physics import Physics
@@ -70,40 +70,6 @@ A1_EPISODES = EnvConfig(
 """The A1's commands; the time limit lets the slowest command cross a tile of 8 m."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class A1EnvConfig:
-    """How the A1 senses, acts, is rewarded and disturbed."""
-
-    randomise: bool = True
-    """Make every robot a little different, delay some and push all of them, by the ranges below."""
-    noise: bool = True
-    """Add sensor noise to what the policy observes."""
-    action_scale: float = 0.5
-    """Change of a joint's target that an action of 1 asks for, rad."""
-    substeps: int = 4
-    """Simulation steps per control step: 50 Hz control."""
-    gait_frequency: float = 2.0
-    """Gait cycles per second."""
-    swing_height: tuple[float, float] = (0.04, 0.1)
-    """Lowest and highest clearance of a good swing, m."""
-    weights: RewardWeights = field(default_factory=RewardWeights)
-    """Weight of each reward term."""
-    friction: tuple[float, float] = (0.5, 1.1)
-    """Range of the friction coefficient."""
-    payload: tuple[float, float] = (-0.5, 1.5)
-    """Range of the mass added to the trunk, kg."""
-    centre_shift: float = 0.03
-    """Largest shift of the trunk's centre of mass along each axis, m."""
-    gain_share: float = 0.1
-    """Largest relative change of the joint controllers' stiffness and damping."""
-    delayed_share: float = 0.5
-    """Share of robots whose actions take effect one control step late."""
-    push_speed: float = 0.4
-    """Largest change of the trunk's velocity by a push, along x and y, m/s."""
-    push_seconds: float = 8.0
-    """Mean time between two pushes, s."""
-
-
 class A1Env(LocomotionEnv):
     """A batch of A1s in MuJoCo."""
 
@@ -111,7 +77,7 @@ class A1Env(LocomotionEnv):
     """Joint targets relative to the stance, in the order of `a1_model.JOINTS`."""
     mirror = a1_terms.mirror()
     episodes = A1_EPISODES
-    """What a symmetric policy needs to know."""
+    felt, unfelt = a1_terms.FELT, a1_terms.UNFELT
 
     def __init__(
         self,
@@ -167,30 +133,8 @@ class A1Env(LocomotionEnv):
 
     def _randomise(self) -> None:
         """Make every simulation another robot on another ground, once for all its episodes."""
-        if not self.settings.randomise:
-            return
-        s, physics, n = self.settings, self.physics, self.num_envs
-        dice = torch.Generator().manual_seed(self.body_seed)
-
-        def draw(low: float, high: float, *shape: int) -> Tensor:
-            return low + (high - low) * torch.rand(n, *shape, generator=dice, dtype=torch.float64)
-
-        trunk, own = physics.model.body("trunk"), physics.model
-        physics.parameter("opt.o_friction")[:, :2] = draw(*s.friction, 1)
-        load = draw(*s.payload, 1) + trunk.mass.item()
-        physics.parameter("body_mass")[:, trunk.id] = load[:, 0]
-        inertia = torch.tensor(trunk.inertia) / trunk.mass.item()
-        physics.parameter("body_inertia")[:, trunk.id] = inertia * load
-        centre = torch.tensor(trunk.ipos) + draw(-s.centre_shift, s.centre_shift, 3)
-        physics.parameter("body_ipos")[:, trunk.id] = centre
-        # MuJoCo writes a position controller as gain[0] * ctrl + bias[1] * q + bias[2] * dq/dt.
-        stiffness, damping = (draw(1 - s.gain_share, 1 + s.gain_share, 1) for _ in range(2))
-        gain, bias = physics.parameter("actuator_gainprm"), physics.parameter("actuator_biasprm")
-        gain[:, :, 0] = torch.tensor(own.actuator_gainprm[:, 0]) * stiffness
-        bias[:, :, 1] = torch.tensor(own.actuator_biasprm[:, 1]) * stiffness
-        bias[:, :, 2] = torch.tensor(own.actuator_biasprm[:, 2]) * damping
-        physics.set_const()
-        self.late = (draw(0.0, 1.0, 1) < s.delayed_share).to(self.device)
+        if self.settings.randomise:
+            self.late = randomise(self.physics, self.settings, self.body_seed).to(self.device)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what training must store to continue, and which robots it had drawn."""
@@ -332,6 +276,10 @@ class A1Env(LocomotionEnv):
             features += self.noise * (2 * self._uniform(*features.shape) - 1)
         # What is about to explode must not reach the learner either.
         return (features * self.scale).clamp(-20.0, 20.0)
+
+    def truth(self, policy: Tensor) -> Float[Tensor, "envs 3"]:
+        """Return the trunk's velocity in its own frame, without noise, scaled as observed."""
+        return (self.body_velocity * self.scale[:3]).clamp(-20.0, 20.0)
 
     def patches(self) -> Float[Tensor, "envs points"]:
         """Return the patches that `sample_patches` would; the scan shares their points."""

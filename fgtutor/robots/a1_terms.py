@@ -15,7 +15,7 @@ from torch import Tensor
 
 from fgtutor.patches import PatchGrid
 from fgtutor.robots.a1_model import JOINT_RANGES, LINKS, MIRROR, MIRROR_SIGNS
-from fgtutor.symmetry import Mirror
+from fgtutor.symmetry import Mirror, join
 
 # Observations -------------------------------------------------------------------------------------
 
@@ -34,6 +34,10 @@ NOISE = {
 }
 """What the policy feels, in order: how many numbers, largest noise in their own unit (m/s, rad/s,
 g, rad, rad/s), and the scale the policy sees them at. Noise and scales as in legged_gym."""
+UNFELT = (0, 1, 2)
+"""What no sensor of the A1 measures: its velocity. A blind policy has to estimate it."""
+FELT = tuple(range(3, 3 + sum(count for count, *_ in NOISE.values())))
+"""What a blind policy observes: the rest of what the policy feels, and the command."""
 SCAN_NOISE, SCAN_SCALE = 0.02, 3.0
 """Largest noise of a scanned height, m, and the scale the policy sees heights at."""
 
@@ -53,14 +57,10 @@ def mirror() -> Mirror:
             (1,) * rows * columns,
         ),
     ]
-    index: list[int] = []
-    sign: list[float] = []
-    for part, signs in parts:
-        index += [len(sign) + i for i in part]
-        sign += [float(s) for s in signs]
+    index, sign = join(parts)
     return Mirror(
-        observation_index=tuple(index),
-        observation_sign=tuple(sign),
+        observation_index=index,
+        observation_sign=sign,
         action_index=MIRROR,
         action_sign=MIRROR_SIGNS,
     )

@@ -20,6 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from fgtutor import patches
+from fgtutor.dreamwaq import VELOCITY, History
 from fgtutor.errors import ConfigError
 from fgtutor.patches import PatchGrid, sample_patches
 from fgtutor.symmetry import Mirror
@@ -63,6 +64,8 @@ class EnvConfig:
     """Row on which training starts."""
     train: bool = True
     """Draw new episodes when one ends; False leaves finished robots where they are."""
+    history: int = 0
+    """Frames that a blind policy remembers; with any, there are groups `history` and `critic`."""
 
 
 def plain_tensors(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -78,7 +81,8 @@ class LocomotionEnv(VecEnv):
     """A batch of robots on a `World`, with observation groups {policy, patch, command, tracking}.
 
     The `tracking` group holds, for the step just taken, (r_v, failed, ended): r_v is 0 once a robot
-    has failed, so a fall can never look feasible.
+    has failed, so a fall can never look feasible. If asked for, `history` holds the last frames of
+    what a blind robot feels and `critic` all that the simulation knows: true velocity, then policy.
     """
 
     grid: PatchGrid
@@ -89,6 +93,10 @@ class LocomotionEnv(VecEnv):
     """How this robot's episodes are drawn unless the caller says otherwise."""
     mirror: Mirror | None = None
     """The robot's left-right symmetry; with one, its policies are made symmetric."""
+    felt: tuple[int, ...] = ()
+    """Which numbers of the `policy` group a blind robot observes: neither velocity nor scan."""
+    unfelt: tuple[int, ...] = ()
+    """Which three of its numbers it has to estimate instead: its velocity."""
 
     @plain_tensors
     def __init__(
@@ -131,6 +139,14 @@ class LocomotionEnv(VecEnv):
         self.return_r_v = torch.zeros(num_envs, device=device)
         self.stuck_from = torch.zeros(num_envs, 2, device=device)
         self.stuck_steps = torch.zeros(num_envs, dtype=torch.long, device=device)
+        self.history = None
+        if self.config.history:
+            if len(self.unfelt) != VELOCITY:
+                raise ConfigError(
+                    f"{type(self).__name__} does not say what a blind policy feels: set `felt` and "
+                    f"{VELOCITY} numbers `unfelt`, or leave history at 0"
+                )
+            self.history = History(self.config.history, len(self.felt), num_envs, device)
         self.reseed(seed)
 
     # What a robot adds ------------------------------------------------------------------------
@@ -163,6 +179,10 @@ class LocomotionEnv(VecEnv):
     def drawing(self) -> Float[np.ndarray, "envs features"]:
         """Return what a figure or a video needs to draw each robot; the robot says what that is."""
 
+    def truth(self, policy: Float[Tensor, "envs features"]) -> Float[Tensor, "envs 3"]:
+        """Return what is `unfelt`; a robot with noisy observations returns it without noise."""
+        return policy[:, list(self.unfelt)]
+
     def rebuild(self) -> None:
         """Rebuild the physics so that nothing of the past remains in it."""
 
@@ -179,12 +199,17 @@ class LocomotionEnv(VecEnv):
             "command": self.command.clone(),
             "tracking": self.tracking.clone(),
         }
+        if self.history:
+            groups["history"] = self.history.see(policy[:, list(self.felt)])
+            groups["critic"] = torch.cat((self.truth(policy), policy), dim=-1)
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     @plain_tensors
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Take one control step; in training, ended episodes begin anew at once."""
         self.advance(actions)
+        if self.history:
+            self.history.advance()
         self.episode_length_buf += 1
         pose, velocity = self.motion()
         fell = self.fallen()
@@ -236,6 +261,8 @@ class LocomotionEnv(VecEnv):
     def start(self, ids: Tensor, poses: Float[Tensor, "n 3"], speed: Tensor | float) -> None:
         """Begin episodes at the given poses and forward speed, without drawing anything."""
         self.place(ids, poses)
+        if self.history:
+            self.history.forget(ids)
         self.episode_length_buf[ids] = 0
         self.return_r_v[ids] = 0.0
         self.stuck_steps[ids] = 0
@@ -244,6 +271,7 @@ class LocomotionEnv(VecEnv):
         self.begin[ids] = poses[:, :2]
         self.target_yaw[ids] = poses[:, 2]
         self.crossing[ids] = False
+        self.turning[ids] = False
         self.command[ids] = 0.0
         self.command[ids, 0] = speed
 
@@ -302,7 +330,9 @@ class LocomotionEnv(VecEnv):
         length, width = self.tile_size
         backwards = self._uniform(n) < 0.3
         x = torch.where(backwards, length - 0.75, torch.full((n,), 0.75))
-        y = width * (0.2 + 0.6 * self._uniform(n))
+        # Near enough to the lane to reach it before the obstacle begins.
+        beside = (self.spreads[self.row[ids], self.column[ids]] + 0.3).clamp(max=0.3 * width)
+        y = self._lane(ids, corner[:, 0] + x) + beside * (2 * self._uniform(n) - 1)
         yaw = torch.where(backwards, torch.full((n,), math.pi), torch.zeros(n))
         across = torch.stack((corner[:, 0] + x, corner[:, 1] + y, yaw), dim=-1)
         inside = 0.1 + 0.8 * self._uniform(n, tries, 2)

@@ -112,6 +112,8 @@ class ToyEnv(LocomotionEnv):
 
     num_actions = 4
     """Rear wheel, front wheel (surface speed), rear leg, front leg (length)."""
+    # Without its speeds and its height above the ground; with the command.
+    felt, unfelt = (0, 1, 2, *range(6, 21)), (3, 4, 5)
 
     def __init__(
         self,

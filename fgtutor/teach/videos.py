@@ -1,25 +1,23 @@
-"""Videos of the toy on its route: the map from above, and from the side the cut that it drives in.
+"""Videos of a robot on its route: the toy in the vertical cut it drives in, the A1 in its scene.
 
 Reads an `Episode` with its body recorded, the terrain and the route; gives frames, a GIF or MP4,
-and a film strip for pages that cannot play a video. What moves is drawn with Pillow onto a picture
-of the map that matplotlib draws once, so that a second of film costs less than a second.
+and a film strip for pages that cannot play a video. A second of the toy's film costs less than a
+second; the A1's is drawn by MuJoCo (`a1_film`).
 """
 
 import itertools
 import math
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import IO, cast
 
 import imageio_ffmpeg
-import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
@@ -27,104 +25,55 @@ from fgtutor.execution import Episode
 from fgtutor.robots.toy import CLIFF, ToyModel
 from fgtutor.routes import Route
 from fgtutor.storage import atomic_write
-from fgtutor.teach.canvas import Picture, policy_colours
-from fgtutor.teach.figures import draw_elevation, draw_route
+from fgtutor.teach.a1_film import A1Film
+from fgtutor.teach.films import FPS, INK, SKY, WIDTH, EpisodeFilm, MapView, font
 from fgtutor.terrain import Terrain
 
-WIDTH = 720
-"""Width of a frame, pixels; like every size here a multiple of 16, which video codecs want."""
 SIDE = (WIDTH, 272)
-"""Size of the side view, pixels."""
+"""Size of the toy's side view, pixels."""
 SCALE = 180
 """Pixels per metre in the side view."""
 BEHIND = 1.5
 """How much ground the side view shows behind the robot's centre, m."""
 SHARP = 2
 """Robot and ground are drawn this many times too large, then reduced: smooth edges."""
-FPS = 12.5
-"""Frames per second: every second control step of the toy, and a whole number of GIF's 1/100 s."""
 HOLD = 1.2
 """How long the last frame stays, s."""
-SKY, EARTH, TURF, INK = "#F3F7FA", "#B7A68A", "#5B4A33", "#1E2328"
+EARTH, TURF = "#B7A68A", "#5B4A33"
 FORMATS = (".mp4", ".gif")
 
 
-class Film:
-    """One episode, ready to be drawn at any moment.
+class Film(EpisodeFilm):
+    """The toy's film: the map above, the side view below."""
 
-    Raises:
-        ConfigError: The episode is empty, or no toy's body was recorded with it.
-    """
+    robot, features = "toy", 9
 
     def __init__(self, episode: Episode, terrain: Terrain, route: Route) -> None:
-        steps = len(episode.poses)
-        if steps == 0 or episode.body is None or episode.body.shape != (steps, 9):
-            got = "none" if episode.body is None else f"body {episode.body.shape}"
-            raise ConfigError(
-                f"a film needs the toy's body at each of {steps} steps, got {got}: record the "
-                "episode with execute(), by a toy"
-            )
-        self.episode, self.route, self.model = episode, route, ToyModel()
-        self.ground = terrain.elevation.filled()
-        self.colours = policy_colours(route.names)
-        self.dt = episode.seconds / steps
-        # The camera floats over the ground: slower than the chassis, or everything would shake.
-        width = max(1, round(0.6 / self.dt)) | 1
-        padded = np.pad(episode.poses[:, 2], width // 2, mode="edge")
-        self.camera = np.convolve(padded, np.ones(width) / width, mode="valid")
+        super().__init__(episode, terrain, route)
+        self.model = ToyModel()
+        self.camera = self.smooth(episode.poses[:, 2], 0.6)
 
-    def times(self, fps: float = FPS) -> list[int]:
-        """Return the steps that a film of this speed shows, the last one included."""
-        steps = np.arange(0, len(self.episode.poses), 1 / (fps * self.dt)).astype(int).tolist()
-        return [*steps, len(self.episode.poses) - 1]
+    def views(self, steps: Iterable[int]) -> Iterator[Image.Image]:
+        """Draw the side view at these steps."""
+        return map(self.side, steps)
+
+    def frames(self, steps: Iterable[int]) -> Iterator[Image.Image]:
+        """Draw map and side view at these steps."""
+        return map(self.frame, steps)
 
     def frame(self, t: int) -> Image.Image:
         """Draw step t: the map above, the side view below."""
-        above, below = self._above(t), self.side(t)
+        pose = self.episode.poses[: t + 1]
+        above = self._map.at(pose[:, :2], pose[-1, 3], self.colours[self.policy(t)])
+        below = self.side(t)
         frame = Image.new("RGB", (WIDTH, above.height + below.height), SKY)
         frame.paste(above, (0, 0))
         frame.paste(below, (0, above.height))
         return frame
 
-    # From above -----------------------------------------------------------------------------------
-
     @cached_property
-    def _map(self) -> tuple[Image.Image, np.ndarray]:
-        """Draw map and route once; return the image, and the matrix from metres to its pixels."""
-        length, width = self.ground.size
-        height = round(np.clip(0.9 * WIDTH * width / length + 40, 160, 640) / 16) * 16
-        figure = Picture(WIDTH / 100, height / 100)
-        axes = figure.subplots()
-        draw_elevation(self.ground, axes=axes)
-        figure.axes[1].remove()  # the colour bar: a film is no place to read numbers
-        draw_route(self.route, self.ground, axes=axes)
-        figure.legends.clear()
-        axes.set_title("", loc="left")
-        axes.set(xlabel="", ylabel="")
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-        return image, axes.transData.get_matrix()
-
-    def _above(self, t: int) -> Image.Image:
-        image, matrix = self._map
-        image = image.copy()
-        draw = ImageDraw.Draw(image)
-        xy = np.column_stack((self.episode.poses[: t + 1, :2], np.ones(t + 1)))
-        # matplotlib counts pixels from the bottom, an image from the top.
-        pixels = (xy @ matrix.T)[:, :2] * (1, -1) + (0, image.height)
-        if t:
-            draw.line([tuple(point) for point in pixels.tolist()], fill=INK, width=2)
-        yaw = self.episode.poses[t, 3]
-        turn = np.array(((math.cos(yaw), -math.sin(yaw)), (math.sin(yaw), math.cos(yaw))))
-        size = max(0.35 * matrix[0, 0], 11)
-        arrow = np.array(((1, 0), (-0.7, 0.62), (-0.35, 0), (-0.7, -0.62))) * size
-        corners = arrow @ turn.T * (1, -1) + pixels[-1]
-        points = [tuple(corner) for corner in corners.tolist()]
-        draw.polygon(points, fill=self.colours[self._policy(t)], outline="white", width=2)
-        return image
-
-    # From the side --------------------------------------------------------------------------------
+    def _map(self) -> MapView:
+        return MapView(self.ground, self.route)
 
     def side(self, t: int) -> Image.Image:
         """Draw the vertical cut along the robot's heading, with the robot in it."""
@@ -143,12 +92,16 @@ class Film:
         draw.line(line, fill=TURF, width=3 * SHARP, joint="curve")
         self._robot(draw, t, place, scale)
         image = image.reduce(SHARP)
-        self._words(ImageDraw.Draw(image), t)
+        self.write(image, t)
+        draw = ImageDraw.Draw(image)
+        right = WIDTH - 14
+        draw.line((right - SCALE / 2, 26, right, 26), fill=INK, width=2)
+        draw.text((right - SCALE / 4, 8), "0.5 m", INK, font(13), anchor="ma")
         return image
 
     def _robot(self, draw: ImageDraw.ImageDraw, t: int, place, scale: float) -> None:
-        m, body = self.model, self.episode.body
-        parts = np.reshape(body[t] if body is not None else (), (3, 3)).tolist()
+        m = self.model
+        parts = np.reshape(self.body[t], (3, 3)).tolist()
         (s, z, angle), *wheels = parts
         forward = np.array((math.cos(angle), math.sin(angle)))
         up = np.array((-forward[1], forward[0]))
@@ -167,36 +120,8 @@ class Film:
         corners = [place(*(centre + a * length / 2 * forward + b * thick / 2 * up))
                    for a, b in outline]  # fmt: skip
         draw.polygon(
-            corners, fill=self.colours[self._policy(t)], outline=INK, width=round(1.5 * SHARP)
+            corners, fill=self.colours[self.policy(t)], outline=INK, width=round(1.5 * SHARP)
         )
-
-    def _words(self, draw: ImageDraw.ImageDraw, t: int) -> None:
-        """Write policy, time and speed; below them a bar of the policies so far; a scale."""
-        name = self._policy(t)
-        draw.text((14, 8), name, fill=self.colours[name], font=_font(22))
-        last = t == len(self.episode.poses) - 1
-        verdict = f"     {self.episode.reason}" if last else ""
-        seconds = (t + 1) * self.dt
-        draw.text(
-            (170, 13), f"{seconds:4.1f} s     {self._speed(t):.2f} m/s{verdict}", INK, _font(16)
-        )
-        steps, y = len(self.episode.policies), SIDE[1] - 12
-        edges = np.flatnonzero(np.diff(self.episode.policies[: t + 1])) + 1
-        for first, after in zip([0, *edges], [*edges, t + 1], strict=True):
-            colour = self.colours[self.route.names[self.episode.policies[first]]]
-            draw.rectangle((first / steps * WIDTH, y, after / steps * WIDTH, SIDE[1]), fill=colour)
-        right = WIDTH - 14
-        draw.line((right - SCALE / 2, 26, right, 26), fill=INK, width=2)
-        draw.text((right - SCALE / 4, 8), "0.5 m", INK, _font(13), anchor="ma")
-
-    def _policy(self, t: int) -> str:
-        return self.route.names[self.episode.policies[t]]
-
-    def _speed(self, t: int) -> float:
-        """Return the speed over the last fifth of a second, m/s."""
-        before = max(0, t - max(1, round(0.2 / self.dt)))
-        gone = np.hypot(*(self.episode.poses[t, :2] - self.episode.poses[before, :2]))
-        return float(gone / ((t - before) * self.dt)) if t > before else 0.0
 
 
 def ground_along(
@@ -217,14 +142,21 @@ def ground_along(
     return s, np.where(np.ptp(around, axis=0) > CLIFF, nearest, ground.height_at(px, py))
 
 
+def film_of(episode: Episode, terrain: Terrain, route: Route) -> EpisodeFilm:
+    """Return the film of whichever robot drove; raises `ConfigError` if no body was recorded."""
+    body = episode.body
+    cls = A1Film if body is not None and body.shape[-1] == A1Film.features else Film
+    return cls(episode, terrain, route)
+
+
 def frames(
     episode: Episode, terrain: Terrain, route: Route, *, fps: float = FPS
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Yield the frames of an episode, one every 1 / fps seconds, the last one held."""
-    film = Film(episode, terrain, route)
     image = np.zeros(0, dtype=np.uint8)
-    for t in film.times(fps):
-        image = np.asarray(film.frame(t))
+    film = film_of(episode, terrain, route)
+    for picture in film.frames(film.times(fps)):
+        image = np.asarray(picture)
         yield image
     for _ in range(round(HOLD * fps)):
         yield image
@@ -236,7 +168,8 @@ def save_video(
     """Write an episode as .mp4 (H.264) or .gif, whole or not at all.
 
     Raises:
-        ConfigError: The suffix is another, no toy's body was recorded, or ffmpeg does not run here.
+        ConfigError: The suffix is another, no body was recorded, or ffmpeg does not run here.
+        RenderingError: The A1 cannot be drawn on this machine.
         StorageError: The system refused to write.
     """
     path = Path(path)
@@ -254,13 +187,14 @@ def save_video(
 def film_strip(
     episode: Episode, terrain: Terrain, route: Route, *, count: int = 8, columns: int = 2
 ) -> Image.Image:
-    """Return side views at `count` moments, evenly spread from start to end, read row by row."""
-    film = Film(episode, terrain, route)
-    width, height = (2 * pixels // 3 for pixels in SIDE)
-    rows, gap = -(-count // columns), 6
+    """Return views at `count` moments, evenly spread from start to end, read row by row."""
+    film = film_of(episode, terrain, route)
+    steps = np.linspace(0, len(episode.poses) - 1, count).astype(int).tolist()
+    views = [view.resize((2 * view.width // 3, 2 * view.height // 3), Image.Resampling.LANCZOS)
+             for view in film.views(steps)]  # fmt: skip
+    (width, height), rows, gap = views[0].size, -(-count // columns), 6
     strip = Image.new("RGB", (columns * (width + gap) - gap, rows * (height + gap) - gap), "white")
-    for n, t in enumerate(np.linspace(0, len(episode.poses) - 1, count).astype(int).tolist()):
-        view = film.side(t).resize((width, height), Image.Resampling.LANCZOS)
+    for n, view in enumerate(views):
         strip.paste(view, (n % columns * (width + gap), n // columns * (height + gap)))
     return strip
 
@@ -304,11 +238,3 @@ def _write_mp4(pictures: Iterator[np.ndarray], path: Path, fps: float) -> None:
     if process.returncode:
         words = complaint.decode(errors="replace").strip()
         raise OSError(words or f"ffmpeg ended with code {process.returncode}")
-
-
-@lru_cache
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    """Return matplotlib's own font: the only one that is certain to be there."""
-    return ImageFont.truetype(
-        str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans-Bold.ttf"), size
-    )

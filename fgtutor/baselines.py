@@ -1,0 +1,297 @@
+"""Other ways to plan, through the same search: classical costs, one policy, parts of ours left out.
+
+Reads a map and a zoo; gives the layers F [nx, ny, 8] that `planning.plan` searches, one for each
+policy that may drive. So a baseline differs from ours in these layers and in nothing else.
+Sources: leggedrobotics/traversability_estimation (Wermelinger et al., "Navigation planning for
+legged robots in challenging terrain", 2016) for the traversability and the values of its
+`robot_filter_parameter.yaml`; Nav2's inflation layer and NavFn planner for the occupancy grid.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from torch import Tensor
+
+from fgtutor.directions import NUM_HEADINGS
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError, PlanningError
+from fgtutor.fusion import fuse
+from fgtutor.pipeline import plan_on_map
+from fgtutor.routes import Route
+from fgtutor.specialist import GENERAL, Specialist
+from fgtutor.tensorization import Assessment, Taus, assess, resolve_taus, steps_on_known
+
+OURS = "ours"
+"""The paper's planner: all specialists, fused."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TraversabilityConfig:
+    """What the classical traversability counts as critical; a cell that reaches it is closed."""
+
+    slope: float = 1.0
+    """Critical slope, rad (slopeFilter)."""
+    step: float = 0.12
+    """Critical height of a step, m (stepFilter)."""
+    step_cells: int = 4
+    """Cells with a critical step that it takes to close a cell (stepFilter)."""
+    step_radius: float = 0.04
+    """Radius of both windows of the step, m (stepFilter)."""
+    roughness: float = 0.05
+    """Critical standard deviation from the plane, m (roughnessFilter)."""
+    plane_radius: float = 0.05
+    """Radius in which the plane is fitted, m (surfaceNormalsFilter, roughnessFilter)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OccupancyConfig:
+    """What an occupancy grid calls an obstacle, and how it is inflated."""
+
+    step: float = 0.12
+    """A cell is lethal where the heights of it and its 8 neighbours differ by more, m. Nav2 knows
+    flat floors only; this is the critical step of `TraversabilityConfig`."""
+    inflation_radius: float = 0.55
+    """How far an obstacle costs anything, m (Nav2's default)."""
+    cost_scaling: float = 10.0
+    """How fast the cost decays, 1/m (Nav2's default)."""
+
+
+def traversability(
+    elevation: ElevationMap, radius: float, config: TraversabilityConfig | None = None
+) -> Float[np.ndarray, "nx ny"]:
+    """Return how traversable a robot of `radius` (m) finds each cell, from 0 (closed) to 1.
+
+    The mean of three layers, each 1 - value / critical value: slope and roughness of the plane
+    fitted around the cell, and the highest step nearby. A cell where one layer is 0 is closed, and
+    so is the robot wherever its disc holds such a cell; elsewhere it gets the disc's mean.
+
+    Radii of the original are smaller than our cells are large, so each reaches at least the 8
+    neighbours. It lets a footprint tolerate a few critical cells and narrow gaps; this does not.
+    """
+    critical = config or TraversabilityConfig()
+    heights = elevation.filled().heights.astype(np.float64)
+    slope, roughness = _plane(heights, elevation.resolution, critical.plane_radius)
+    step = _highest_step(heights, elevation.resolution, critical)
+    layers = np.stack(
+        [slope / critical.slope, step / critical.step, roughness / critical.roughness]
+    )
+    layers = 1 - np.minimum(layers, 1)
+    free = (layers > 0).all(axis=0)
+    disc = _disc(radius, elevation.resolution)
+    mean = ndimage.convolve(layers.mean(axis=0), disc / disc.sum(), mode="nearest")
+    return np.where(ndimage.minimum_filter(free, footprint=disc, mode="nearest"), mean, 0.0)
+
+
+def _plane(
+    heights: Float[np.ndarray, "nx ny"], resolution: float, radius: float
+) -> tuple[Float[np.ndarray, "nx ny"], Float[np.ndarray, "nx ny"]]:
+    """Fit a plane around each cell; return its slope, rad, and the deviation from it, m."""
+    disc = _disc(max(radius, 1.5 * resolution), resolution).astype(np.float64)
+    reach = len(disc) // 2
+    across = np.arange(-reach, reach + 1)[:, None] * resolution * disc
+    n, spread = disc.sum(), (across**2).sum()
+
+    def total(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        return ndimage.correlate(values, weights, mode="nearest")
+
+    # Least squares on a symmetric window: the sums of x, y and xy vanish.
+    gradient = [total(heights, weights) / spread for weights in (across, across.T)]
+    steepness = gradient[0] ** 2 + gradient[1] ** 2
+    mean = total(heights, disc) / n
+    residual = total(heights**2, disc) - n * mean**2 - steepness * spread
+    # Heights deviate along z, the plane's normal leans by the slope: distances are shorter.
+    deviation = np.sqrt(np.maximum(residual, 0) / (n - 1) / (1 + steepness))
+    return np.arctan(np.sqrt(steepness)), deviation
+
+
+def _highest_step(
+    heights: Float[np.ndarray, "nx ny"], resolution: float, critical: TraversabilityConfig
+) -> Float[np.ndarray, "nx ny"]:
+    """Return the highest step near each cell, less where only few cells have a critical one, m."""
+    disc = _disc(max(critical.step_radius, 1.5 * resolution), resolution)
+    window = {"footprint": disc, "mode": "nearest"}
+    step = ndimage.maximum_filter(heights, **window) - ndimage.minimum_filter(heights, **window)
+    count = ndimage.convolve((step > critical.step).astype(float), disc * 1.0, mode="nearest")
+    return ndimage.maximum_filter(step, **window) * np.minimum(1, count / critical.step_cells)
+
+
+def occupancy(
+    elevation: ElevationMap, radius: float, config: OccupancyConfig | None = None
+) -> Float[np.ndarray, "nx ny"]:
+    """Return the feasibility that makes 1 / F the cost of an inflated occupancy grid.
+
+    A cell nearer than `radius` (m, the robot's inscribed one) to a lethal cell is closed; beyond it
+    the cost decays exponentially, c = 252 exp(-scaling (distance - radius)), and NavFn's step costs
+    50 + 0.8 c; F is 50 over that.
+    """
+    settings = config or OccupancyConfig()
+    heights = elevation.filled().heights
+    around = {"size": 3, "mode": "nearest"}
+    relief = ndimage.maximum_filter(heights, **around) - ndimage.minimum_filter(heights, **around)
+    lethal = relief > settings.step
+    if not lethal.any():
+        return np.ones(elevation.shape)
+    distance = np.asarray(ndimage.distance_transform_edt(~lethal)) * elevation.resolution
+    cost = 252 * np.exp(-settings.cost_scaling * (distance - radius))
+    cost[distance > settings.inflation_radius] = 0
+    return np.where(distance <= radius, 0.0, 50 / (50 + 0.8 * cost))
+
+
+def _disc(radius: float, resolution: float) -> Bool[np.ndarray, "side side"]:
+    """Return which cells around one have their centre within `radius`, m."""
+    reach = math.floor(radius / resolution + 1e-6)
+    offset = np.arange(-reach, reach + 1)
+    return np.hypot(*np.meshgrid(offset, offset)) <= radius / resolution + 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A map as planners see it: what is computed of it is computed once, whoever asks."""
+
+    elevation: ElevationMap
+    """The map that is planned on."""
+    zoo: Mapping[str, Specialist]
+    """All policies, the generalist among them."""
+    taus: Taus = "calibrated"
+    """Thresholds of w_ood."""
+    _known: dict[str, Assessment] = field(default_factory=dict)
+
+    @property
+    def specialists(self) -> list[str]:
+        """The names of all policies but the generalist."""
+        return [name for name in self.zoo if name != GENERAL]
+
+    @property
+    def radius(self) -> float:
+        """The robot's inscribed radius, as its patch grid's footprint has it, m."""
+        return next(iter(self.zoo.values())).grid.footprint[1]
+
+    def assessment(self, name: str) -> Assessment:
+        """Return f and L_recon of one policy."""
+        if name not in self._known:
+            self._known[name] = assess(self.elevation, self.zoo[name])
+        return self._known[name]
+
+    def f(self, name: str) -> Float[Tensor, "nx ny 8"]:
+        """Return f of one policy, 0 for steps from or to an unknown cell or off the map."""
+        return self._on_known(self.assessment(name).f)
+
+    def tensor(self, name: str) -> Float[Tensor, "nx ny 8"]:
+        """Return F_i of one policy, as `tensorize` does."""
+        low, high = resolve_taus(self.taus, self.zoo[name])
+        return self._on_known(self.assessment(name).weighted(low, high))
+
+    def _on_known(self, values: Float[Tensor, "nx ny 8"]) -> Float[Tensor, "nx ny 8"]:
+        return values * torch.from_numpy(steps_on_known(self.elevation.known))
+
+
+Layers = dict[str, Float[Tensor, "nx ny 8"]]
+"""F of each policy that may drive, by name."""
+Planner = Callable[[View], Sequence[Layers]]
+"""Gives the layers to plan on; of several, the cheapest route is taken."""
+
+
+def single(name: str, view: View) -> Sequence[Layers]:
+    """Plan for one policy, by its own tensor."""
+    return [{name: view.tensor(name)}]
+
+
+def ours(view: View) -> Sequence[Layers]:
+    """Plan for all specialists, fused (the paper)."""
+    return [{name: view.tensor(name) for name in view.specialists}]
+
+
+def without_ood(view: View) -> Sequence[Layers]:
+    """Ours without w_ood: believe each f wherever it is asked."""
+    return [{name: view.f(name) for name in view.specialists}]
+
+
+def without_heading(view: View) -> Sequence[Layers]:
+    """Ours with one number a cell, the mean of F_i over the headings."""
+    layers = {name: view.tensor(name).mean(dim=-1) for name in view.specialists}
+    return [{name: _all_headings(layer) for name, layer in layers.items()}]
+
+
+def without_fusion(view: View) -> Sequence[Layers]:
+    """Ours without fusion: one specialist drives all the way, the one with the cheapest route."""
+    return [{name: view.tensor(name)} for name in view.specialists]
+
+
+def classical(
+    cells: Callable[[ElevationMap, float], Float[np.ndarray, "nx ny"]], view: View
+) -> Sequence[Layers]:
+    """Plan on a classical map, which knows of no policies; the generalist drives."""
+    return [{GENERAL: _all_headings(torch.from_numpy(cells(view.elevation, view.radius)))}]
+
+
+def classical_switched(
+    cells: Callable[[ElevationMap, float], Float[np.ndarray, "nx ny"]], view: View
+) -> Sequence[Layers]:
+    """Plan on a classical map; our policy map P says which specialist drives."""
+    layer = _all_headings(torch.from_numpy(cells(view.elevation, view.radius)))
+    _, policy_map = fuse([view.tensor(name) for name in view.specialists])
+    return [{name: layer * (policy_map == i) for i, name in enumerate(view.specialists)}]
+
+
+def _all_headings(values: Float[Tensor, "nx ny"]) -> Float[Tensor, "nx ny 8"]:
+    return values[..., None].expand(-1, -1, NUM_HEADINGS)
+
+
+def planners(zoo: Mapping[str, Specialist]) -> dict[str, Planner]:
+    """Return every planner that a zoo allows, by name; without a generalist, those it drives for
+    are missing."""
+    generalist = GENERAL in zoo
+    return {
+        **{name: partial(single, name) for name in zoo if name != GENERAL},
+        OURS: ours,
+        **({GENERAL: partial(single, GENERAL)} if generalist else {}),
+        "no-ood": without_ood,
+        "no-heading": without_heading,
+        "no-fusion": without_fusion,
+        **({"traversability": partial(classical, traversability)} if generalist else {}),
+        "traversability+P": partial(classical_switched, traversability),
+        **({"occupancy": partial(classical, occupancy)} if generalist else {}),
+        "occupancy+P": partial(classical_switched, occupancy),
+    }
+
+
+def find_route(
+    planner: Planner,
+    view: View,
+    start: tuple[float, float],
+    goal: tuple[float, float],
+    *,
+    f_min: float = 0.1,
+    switch_cost: float = 0.0,
+) -> Route:
+    """Return the planner's cheapest route; its `names` are the policies that may drive it.
+
+    Raises `PlanningError` if there is none, and `ConfigError` if the planner offers no layers.
+    """
+    routes: list[Route] = []
+    refusal: PlanningError | None = None
+    for layers in planner(view):
+        team = {name: view.zoo[name] for name in layers}
+        try:
+            plan = plan_on_map(
+                view.elevation,
+                team,
+                start,
+                goal,
+                tensors=layers,
+                f_min=f_min,
+                switch_cost=switch_cost,
+            )
+        except PlanningError as error:
+            refusal = error
+        else:
+            routes.append(plan.route)
+    if routes:
+        return min(routes, key=lambda route: route.cost)
+    raise refusal or ConfigError("this planner has no policy to plan for: the zoo is empty")

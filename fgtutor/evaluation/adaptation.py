@@ -1,0 +1,374 @@
+"""Table I: the better the policy, the shorter the route that feasibility allows it.
+
+Reads checkpoints of one specialist and a number of trials; plans and drives each of them over the
+same maps, on which three ways lead around a wall: the shorter the way, the higher its steps. Gives
+route, length and SPL by checkpoint. Source: paper, Sec. IV-A (Table I, Fig. 4).
+
+SPL divides by a reference length, and the paper does not say by which. Its numbers are those of the
+straight line of 5.0 m (0.51 * 9.73 m), which no robot could walk: so we give SPL against `straight`
+and against `geodesic`, the shortest way over cells that are no wall.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from fgtutor.errors import ConfigError, PlanningError, TerrainError
+from fgtutor.evaluation.cost import estimate
+from fgtutor.evaluation.mapchart import draw_maps
+from fgtutor.evaluation.metrics import spl
+from fgtutor.evaluation.report import Share, markdown, write_report
+from fgtutor.evaluation.runner import Row, Task
+from fgtutor.evaluation.shards import RunConfig, collect, finished, settings_of
+from fgtutor.evaluation.success import TrialsConfig, terrain_seed
+from fgtutor.execution import execute_batch
+from fgtutor.obstacles import SCALES, Course
+from fgtutor.pipeline import plan_on_map
+from fgtutor.planning import plan
+from fgtutor.routes import Route
+from fgtutor.specialist import ZOO, Specialist, load_zoo
+from fgtutor.tensorization import tensorize
+from fgtutor.terrain import Section, Terrain, rasterise
+
+COMMAND = "evaluate adaptation"
+CHECKPOINTS = "_checkpoints"
+"""Folder of a shipped zoo that holds the early, mid and late checkpoint of its steps."""
+WAYS = ("short", "middle", "long")
+"""The ways around the wall, from the highest steps to the lowest."""
+LENGTHS = (9.9, 14.5, 26.3)
+"""What they measure from start to goal along the cells, m; about as in the paper's Table I."""
+STRAIGHT, SIDE, BELOW = 5.0, 1.5, 1.0
+"""From start to goal; from either to the border beside it, and to the border below, m."""
+GATES, GATE_WIDTH = (2.5, 5.1, 11.0), 1.8
+"""Where each way's gate begins beyond the line from start to goal, and how wide it is, m."""
+WALL = 0.6
+"""Height of the wall, m; none of our robots climbs it."""
+TREADS = 3
+"""Treads of a gate's flight: two steps up, two down."""
+RESAMPLES = 2000
+"""Resamples of a bootstrap interval."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptationConfig(RunConfig):
+    """Plan with early, mid and late checkpoints of one policy, the paper's Table I."""
+
+    robot: str = "toy"
+    """Which robot."""
+    trials: int = 100
+    """Trials per checkpoint."""
+    maps: int = 20
+    """Maps that the trials are spread over; their steps differ a little."""
+    seed: int = 0
+    """What maps and starts are drawn from."""
+    heights: tuple[float, float, float] = (0.87, 0.67, 0.2)
+    """Risers of the short, the middle and the long way, as shares of the robot's highest one."""
+    taus: Literal["paper", "calibrated"] = "calibrated"
+    """Thresholds of w_ood."""
+    f_min: float = 0.25
+    """Edges less feasible than this do not exist; a robot that may go around can be choosy."""
+    cost: Literal["length", "inverse"] = "length"
+    """Edge cost: 1 / F times the step's length; or 1 / F (the paper), by which a diagonal step is
+    no longer than a straight one, and a route may zigzag."""
+    zoo: Path | None = None
+    """Folder of checkpoints, a specialist folder each; default: those of the shipped steps."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.maps < 1 or self.trials < 1:
+            raise ConfigError(f"need trials and maps >= 1, got {self.trials} and {self.maps}")
+        if not all(0 <= share <= 1.5 for share in self.heights):
+            raise ConfigError(f"heights must be shares from 0 to 1.5, got {self.heights}")
+
+    @property
+    def folder(self) -> Path:
+        """Where the checkpoints lie."""
+        return self.zoo or ZOO / self.robot / CHECKPOINTS
+
+    def load_checkpoints(self) -> dict[str, Specialist]:
+        """Return the checkpoints by name, the least trained one first."""
+        zoo = load_zoo(self.robot, self.folder, include_general=True)
+        return dict(sorted(zoo.items(), key=lambda item: item[1].provenance.get("samples", 0)))
+
+    def seeds(self, index: int) -> tuple[int, ...]:
+        """Return the seeds of the trials on one map: every n-th."""
+        trials = range(index, self.trials, min(self.maps, self.trials))
+        return tuple(terrain_seed(self.seed, trial) for trial in trials)
+
+
+def make_map(robot: str, seed: int, heights: Sequence[float] = AdaptationConfig.heights) -> Terrain:
+    """Make a map with a wall between start and goal, and three gates in it, the nearest first.
+
+    In each gate lie two steps up and two down. The seed draws their risers (up to a tenth less than
+    `heights`, shares of the robot's highest) and their treads; the wall and the gates stay.
+    Raises `TerrainError` for an unknown robot.
+    """
+    if robot not in SCALES:
+        raise TerrainError(f"unknown robot {robot!r}: choose one of {', '.join(SCALES)}")
+    width = BELOW + GATES[-1] + GATE_WIDTH
+    scale = replace(SCALES[robot], width=width, length=STRAIGHT + 2 * SIDE)
+    course = Course(scale, 1.0, np.random.default_rng((seed, 2)))
+    thickness = course.snap(TREADS * fmean(scale.step_tread))
+    x0 = course.snap((scale.length - thickness) / 2)
+    x1 = course.snap(x0 + thickness)
+    course.full(0.0, scale.length)
+    edge, gates = 0.0, []
+    for beyond, height in zip(GATES, heights, strict=True):
+        y0, y1 = course.snap(BELOW + beyond), course.snap(BELOW + beyond + GATE_WIDTH)
+        course.block(x0, x1, edge, y0, WALL)
+        _lay_flight(course, (x0, x1), (y0, y1), height * scale.step_height[1])
+        gates.append(Section(name="steps", x0=x0, y0=y0, x1=x1, y1=y1))
+        edge = y1
+    start, goal = (SIDE, BELOW), (SIDE + STRAIGHT, BELOW)
+    return Terrain(
+        name="nested ways",
+        robot=robot,
+        difficulty=1.0,
+        seed=seed,
+        elevation=rasterise(course.boxes, (scale.length, width), scale.resolution),
+        boxes=tuple(course.boxes),
+        start=start,
+        goal=goal,
+        sections=tuple(gates),
+        lane=(start, goal),
+    )
+
+
+def _lay_flight(
+    course: Course, x: tuple[float, float], y: tuple[float, float], highest: float
+) -> None:
+    """Lay two steps up and two down between x[0] and x[1]."""
+    first, second = highest * course.dice.uniform(0.9, 1.0, 2)
+    shares = np.cumsum(course.dice.uniform(0.9, 1.1, TREADS))
+    borders = [x[0], *(course.snap(x[0] + (x[1] - x[0]) * share / shares[-1]) for share in shares)]
+    for near, far, top in zip(borders, borders[1:], (first, first + second, second), strict=False):
+        course.block(near, far, *y, float(top))
+
+
+def geodesic(terrain: Terrain) -> float:
+    """Return the length of the shortest way from start to goal over cells that are no wall, m.
+
+    It goes from cell to cell in eight headings, as routes do: no route is shorter.
+    """
+    open_ = np.where(terrain.elevation.heights < WALL - 1e-3, 1.0, 0.0)
+    free = np.repeat(open_[..., None], 8, axis=-1)
+    return plan(
+        free,
+        np.zeros(free.shape, dtype=int),
+        grid=terrain.elevation,
+        start=terrain.start,
+        goal=terrain.goal,
+        cost="length",
+    ).length
+
+
+def way_of(xy: Float[np.ndarray, "n 2"], terrain: Terrain) -> str | None:
+    """Return which way the points go, by the gate in which they pass the wall's middle."""
+    gate = terrain.sections[0]
+    y = xy[np.abs(xy[:, 0] - (gate.x0 + gate.x1) / 2).argmin(), 1]
+    ways = (
+        way for way, gate in zip(WAYS, terrain.sections, strict=True) if gate.y0 <= y <= gate.y1
+    )
+    return next(ways, None)
+
+
+def find_plans(
+    terrain: Terrain, zoo: Mapping[str, Specialist], config: AdaptationConfig
+) -> dict[str, tuple[Float[Tensor, "nx ny 8"], Route | None]]:
+    """Return each checkpoint's tensor on a map and its route, None where there is no way for it."""
+    plans = {}
+    for name, specialist in zoo.items():
+        tensor = tensorize(terrain.elevation, specialist, taus=config.taus)
+        try:
+            route = plan_on_map(
+                terrain.elevation,
+                {name: specialist},
+                terrain.start,
+                terrain.goal,
+                f_min=config.f_min,
+                cost=config.cost,
+                tensors={name: tensor},
+            ).route
+        except PlanningError:
+            route = None
+        plans[name] = tensor, route
+    return plans
+
+
+def run_task(config: AdaptationConfig, index: int) -> list[Row]:
+    """Do one task: all trials of all checkpoints on one map."""
+    zoo, seeds = config.load_checkpoints(), config.seeds(index)
+    terrain = make_map(config.robot, terrain_seed(config.seed, index), config.heights)
+    shortest = round(geodesic(terrain), 3)
+    return [
+        {
+            "policy": name,
+            "ground": terrain.seed,
+            "seed": seed,
+            **outcome,
+            "straight": STRAIGHT,
+            "geodesic": shortest,
+        }
+        for name, (_, route) in find_plans(terrain, zoo, config).items()
+        for seed, outcome in zip(seeds, _drive(route, terrain, zoo[name], seeds), strict=True)
+    ]
+
+
+def _drive(
+    route: Route | None, terrain: Terrain, specialist: Specialist, seeds: Sequence[int]
+) -> list[Row]:
+    """Drive a route once a seed, all at once; lengths in m."""
+    n = len(seeds)
+    if route is None:
+        return [{"outcome": "no_route", "length": 0.0, "way": None, "planned": None}] * n
+    planned = {"way": way_of(route.xy, terrain), "planned": round(route.length, 3)}
+    team = {specialist.name: specialist}
+    episodes = execute_batch([route] * n, [terrain] * n, team, seeds=seeds)
+    return [{"outcome": e.reason, "length": round(e.length, 3), **planned} for e in episodes]
+
+
+def make_tasks(config: AdaptationConfig) -> list[Task]:
+    """Cut the evaluation into tasks, one a map."""
+    return [
+        Task(name=f"map-{index:05d}", function=run_task, arguments=(config, index))
+        for index in range(min(config.maps, config.trials))
+    ]
+
+
+def summarise(trials: Sequence[Row]) -> Row:
+    """Return what the trials of one checkpoint come to; the length is that of its successes.
+
+    Intervals are bootstrapped over the maps: trials on one map resemble each other.
+    """
+    maps: dict[int, list[Row]] = {}
+    for trial in trials:
+        maps.setdefault(trial["ground"], []).append(trial)
+    reached = [[t for t in group if t["outcome"] == "reached"] for group in maps.values()]
+    return {
+        "policy": trials[0]["policy"],
+        "trials": len(trials),
+        "successes": sum(len(group) for group in reached),
+        "ways": [w for w in WAYS if any(t["way"] == w for t in trials)],
+        "length": _estimate(reached, lambda group: fmean(t["length"] for t in group)),
+        **{
+            f"spl_{reference}": _estimate(list(maps.values()), partial(_spl, reference=reference))
+            for reference in ("straight", "geodesic")
+        },
+    }
+
+
+def _spl(trials: Sequence[Row], reference: str) -> float:
+    success = np.array([trial["outcome"] == "reached" for trial in trials], dtype=float)
+    length, shortest = (np.array([t[key] for t in trials]) for key in ("length", reference))
+    return spl(success, length, shortest)
+
+
+def _estimate(
+    groups: Sequence[Sequence[Row]], mean: Callable[[Sequence[Row]], float]
+) -> tuple[float, float, float] | None:
+    """Return a mean of all trials and its 95 % interval, from groups of trials drawn anew."""
+    groups = [group for group in groups if group]
+    if not groups:
+        return None
+    value = mean([trial for group in groups for trial in group])
+    means, sizes = np.array([mean(group) for group in groups]), np.array([len(g) for g in groups])
+    drawn = np.random.default_rng(0).integers(len(groups), size=(RESAMPLES, len(groups)))
+    resampled = (means * sizes)[drawn].sum(axis=1) / sizes[drawn].sum(axis=1)
+    low, high = np.percentile(resampled, (2.5, 97.5)).tolist()
+    return value, low, high
+
+
+def summaries(trials: Sequence[Row], checkpoints: Sequence[str]) -> list[Row]:
+    """Return one summary a checkpoint."""
+    return [summarise([t for t in trials if t["policy"] == name]) for name in checkpoints]
+
+
+def table(rows: Sequence[Row], zoo: Mapping[str, Specialist]) -> str:
+    """Return the summaries as a Markdown table; a dash stands where nothing was reached."""
+
+    def write(estimate: tuple[float, float, float] | None, digits: int) -> str:
+        if estimate is None:
+            return "-"
+        value, low, high = (f"{number:.{digits}f}" for number in estimate)
+        return f"{value} ({low}-{high})"
+
+    lines = [
+        [
+            row["policy"],
+            f"{zoo[row['policy']].provenance.get('samples', 0):,}",
+            ", ".join(row["ways"]) or "none",
+            write(row["length"], 2),
+            Share(successes=row["successes"], trials=row["trials"]),
+            write(row["spl_straight"], 3),
+            write(row["spl_geodesic"], 3),
+        ]
+        for row in rows
+    ]
+    columns = "checkpoint, samples, way, length (m), success (%), SPL straight, SPL geodesic"
+    return markdown(columns.split(", "), lines)
+
+
+def run(config: AdaptationConfig) -> int:
+    """Evaluate from the command line, print the table and write the report."""
+    began = time.time()
+    zoo, tasks = config.load_checkpoints(), make_tasks(config)
+    first = make_map(config.robot, terrain_seed(config.seed, 0), config.heights)
+    digests = TrialsConfig(robot=config.robot, zoo=config.folder).zoo_digests()
+    settings = settings_of(config, COMMAND, zoo=digests)
+    left = len(tasks) - len(finished(tasks, settings, config))
+    if left:
+        # The estimate takes the straight line for the length of a trial.
+        detour = fmean(LENGTHS) / STRAIGHT
+        trials = config.trials * len(zoo)
+        cost = estimate(zoo, [first], grounds=len(tasks), episodes=round(trials * detour))
+        cores = config.workers or os.cpu_count() or 1
+        cost = replace(cost, episodes=trials)
+        print(f"{left} of {len(tasks)} tasks to do; all of them: {cost.on(cores)}", flush=True)
+    done = collect(tasks, settings, config, progress=True)
+    if not done.complete:
+        print(f"{done}; give the other parts' folders to --merge for the table")
+        return 0
+    text = table(summaries(done.rows, list(zoo)), zoo)
+    caption = (
+        f"{config.trials:,} trials a checkpoint on {len(tasks)} maps, with 95 % intervals; robot "
+        f"{config.robot}, tau {config.taus}, f_min {config.f_min:g}, cost {config.cost}, "
+        f"seed {config.seed}. SPL against the straight line of {STRAIGHT:g} m, as the paper's "
+        f"numbers imply, and against the shortest way over no wall, {geodesic(first):.1f} m."
+    )
+    print(f"{text}\n\n{caption}")
+    if config.out:
+        plans = find_plans(first, zoo, config)
+        picture = draw_maps(
+            first.elevation,
+            plans,
+            title="The better the policy, the shorter its route",
+            f_min=config.f_min,
+            walls=first.elevation.heights > WALL - 1e-3,
+            places=dict(zip(WAYS, first.sections, strict=True)),
+        )
+        stories = json.dumps({n: route and route.to_json() for n, (_, route) in plans.items()})
+        write_report(
+            config.out,
+            done,
+            title=f"Planning adapts to the policy ({config.robot})",
+            table=text,
+            caption=caption,
+            settings=settings,
+            began=began,
+            figures={
+                "maps.svg": lambda path: path.write_text(picture),
+                "routes.json": lambda path: path.write_text(stories),
+            },
+        )
+        print(f"report -> {config.out}")
+    return 0

@@ -1,0 +1,76 @@
+"""What an evaluation will take, before it starts: a small sample, measured here and now.
+
+Reads a zoo and one terrain of each kind; gives numbers of maps and episodes, and hours.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from fgtutor.evaluation.trials import EPISODES
+from fgtutor.execution import FollowConfig, execute_batch
+from fgtutor.planning import plan
+from fgtutor.specialist import Specialist
+from fgtutor.tensorization import assess
+from fgtutor.terrain import Terrain
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """What an evaluation takes if every trial has a route and none fails early."""
+
+    maps: int
+    """Maps to assess, one a ground and policy of the zoo."""
+    episodes: int
+    """Episodes to drive."""
+    seconds: float
+    """Time on one core, s."""
+
+    def on(self, cores: int) -> str:
+        """Say it, for a number of cores."""
+        hours = self.seconds / cores / 3600
+        time = f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min"
+        return (
+            f"{self.maps:,} maps to assess and up to {self.episodes:,} episodes, at most about "
+            f"{time} on {cores} core{'s' * (cores > 1)} like this one"
+        )
+
+
+def estimate(
+    zoo: Mapping[str, Specialist], terrains: Sequence[Terrain], *, grounds: int, episodes: int
+) -> Cost:
+    """Measure one map and one second of driving, and work out what `grounds` and `episodes` of
+    each terrain will take."""
+    name, specialist = next(iter(zoo.items()))
+    sample, at_once = terrains[0], min(episodes, EPISODES)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as in the tasks
+    try:
+        began = time.perf_counter()
+        assess(sample.elevation, specialist)
+        assessed = time.perf_counter()
+        free = np.ones((*sample.elevation.shape, 8))
+        route = plan(free, 0 * free, grid=sample.elevation, start=sample.start, goal=sample.goal)
+        execute_batch(
+            [route] * at_once,
+            [sample] * at_once,
+            {name: specialist},
+            seeds=range(at_once),
+            config=FollowConfig(patience=0.0, grace=1.0),
+        )
+        driven = time.perf_counter()
+    finally:
+        torch.set_num_threads(threads)
+    cell_seconds = (assessed - began) / sample.elevation.heights.size
+    drive_seconds = (driven - assessed) / at_once
+    cells = sum(terrain.elevation.heights.size for terrain in terrains)
+    metres = sum(float(np.hypot(*np.subtract(t.goal, t.start))) for t in terrains)
+    return Cost(
+        maps=grounds * len(zoo) * len(terrains),
+        episodes=episodes * len(terrains),
+        seconds=grounds * len(zoo) * cells * cell_seconds
+        + episodes * metres / specialist.command[0] * drive_seconds,
+    )

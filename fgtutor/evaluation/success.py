@@ -1,0 +1,286 @@
+"""Success rates over drawn grounds: what the matrix and the ablation have in common.
+
+Reads a `TrialsConfig`, terrains and the names of planners; gives a row a pair, and a report folder.
+Trial k of a terrain is the same ground, start and goal for all planners.
+Source: paper, Sec. IV-B: 40 tasks of 250 trials a terrain, failures by reason.
+"""
+
+import hashlib
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from fgtutor.baselines import planners
+from fgtutor.errors import ConfigError, ReportError
+from fgtutor.evaluation.chart import share_chart
+from fgtutor.evaluation.cost import estimate
+from fgtutor.evaluation.metrics import wilson_interval
+from fgtutor.evaluation.report import Share, write_report
+from fgtutor.evaluation.runner import Row, Task
+from fgtutor.evaluation.shards import RunConfig, collect, finished, settings_of
+from fgtutor.evaluation.trials import Ground, drive
+from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo
+from fgtutor.storage import check_writable, write_json
+from fgtutor.terrain import Terrain, make_terrain
+
+GROUNDS = 25
+"""Grounds of one task, where each is driven once."""
+PAPER_GROUNDS, PAPER_TRIALS = 40, 10_000
+"""Tasks of a terrain, and its trials a policy: 40 times 250 (paper, Sec. IV-B)."""
+CLEARANCE = 0.5
+"""Distance of a drawn start or goal from the obstacle and from the map's border, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialsConfig(RunConfig):
+    """What success rates are measured on."""
+
+    robot: str = "toy"
+    """Which robot."""
+    trials: int | None = None
+    """Trials per policy and terrain; default: 50, for the paper's protocol its 10,000."""
+    seed: int = 0
+    """What the terrains and the starts are drawn from."""
+    protocol: Literal["grounds", "paper"] = "grounds"
+    """"grounds" crosses a new ground in each trial; "paper" draws 40 grounds with a start and a
+    goal each (mixed: its own) and crosses each 250 times."""
+    difficulty: float = 1.0
+    """Difficulty of all terrains."""
+    taus: Literal["paper", "calibrated"] = "calibrated"
+    """Thresholds of w_ood."""
+    f_min: float = 0.1
+    """Edges less feasible than this do not exist."""
+    switch_cost: float = 0.0
+    """Extra cost of changing the policy; 0 is the paper's."""
+    zoo: Path | None = None
+    """Folder of specialist folders; default: the shipped zoo."""
+    json: Path | None = None
+    """Write the table's rows here."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.trials is not None and self.trials < 1:
+            raise ConfigError(f"need trials >= 1, got {self.trials}")
+
+    @property
+    def count(self) -> int:
+        """Trials per policy and terrain."""
+        return self.trials or (PAPER_TRIALS if self.protocol == "paper" else 50)
+
+    @property
+    def grounds(self) -> int:
+        """Grounds per terrain."""
+        return min(self.count, PAPER_GROUNDS) if self.protocol == "paper" else self.count
+
+    def load_zoo(self) -> dict[str, Specialist]:
+        """Return the specialists and the generalist, if there is one."""
+        return load_zoo(self.robot, self.zoo, include_general=True)
+
+    def zoo_digests(self) -> dict[str, str]:
+        """Return a digest of each of them, which changes with any of its weights."""
+        home = self.zoo or ZOO / self.robot
+        return {
+            path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+            for path in sorted(home.glob(f"[!._]*/{DESCRIPTION}"))
+        }
+
+
+def terrain_seed(seed: int, trial: int) -> int:
+    """Return the terrain seed of a trial: odd, since training draws even ones."""
+    return 2 * (seed * 1_000_000 + trial) + 1
+
+
+def make_ground(config: TrialsConfig, terrain: str, index: int) -> Ground:
+    """Make one ground, and say which trials it stands for: every n-th of the terrain's."""
+    made = make_terrain(
+        terrain,
+        robot=config.robot,
+        difficulty=config.difficulty,
+        seed=terrain_seed(config.seed, index),
+    )
+    if config.protocol == "paper" and terrain != "mixed":
+        made = with_random_ends(made, made.seed)
+    trials = range(index, config.count, config.grounds)
+    return Ground(terrain=made, seeds=tuple(terrain_seed(config.seed, trial) for trial in trials))
+
+
+def with_random_ends(terrain: Terrain, seed: int) -> Terrain:
+    """Return the terrain with start and goal drawn anew, each on the flat ground at one end.
+
+    Which end the start is at is drawn too. Nobody stands at random in a chasm or on a wall.
+    """
+    dice = np.random.default_rng((seed, 1))
+    (x0, y0, x1, y1), parts = terrain.elevation.extent, terrain.sections
+    flats = ((x0, parts[0].x0), (parts[-1].x1, x1)) if parts else ((x0, x1), (x0, x1))
+
+    def draw(low: float, high: float) -> float:
+        room = max(high - low - 2 * CLEARANCE, 0.0)
+        return float((low + high) / 2 + room * (dice.random() - 0.5))
+
+    ends = [(draw(low, high), draw(y0, y1)) for low, high in flats]
+    if dice.random() < 0.5:
+        ends.reverse()
+    return replace(terrain, start=ends[0], goal=ends[1])
+
+
+def make_tasks(
+    config: TrialsConfig, terrains: Sequence[str], policies: Sequence[str]
+) -> list[Task]:
+    """Cut an evaluation into tasks; the cut depends on the trials only, never on the workers."""
+    for name in terrains:  # an unknown name fails here, not in a worker an hour later
+        make_terrain(name, robot=config.robot, difficulty=config.difficulty)
+    # A ground that is driven 250 times is work enough for a task.
+    size = 1 if config.protocol == "paper" else GROUNDS
+    return [
+        Task(
+            name=f"{terrain}-{first:05d}",
+            function=run_task,
+            arguments=(config, terrain, tuple(policies), range(config.grounds)[first:][:size]),
+        )
+        for terrain in terrains
+        for first in range(0, config.grounds, size)
+    ]
+
+
+def run_task(
+    config: TrialsConfig, terrain: str, policies: Sequence[str], grounds: Sequence[int]
+) -> list[Row]:
+    """Do one task: some grounds of one terrain, all policies."""
+    zoo = config.load_zoo()
+    known = planners(zoo)
+    trials = drive(
+        [make_ground(config, terrain, index) for index in grounds],
+        {name: known[name] for name in policies},
+        zoo,
+        taus=config.taus,
+        f_min=config.f_min,
+        switch_cost=config.switch_cost,
+    )
+    return [asdict(trial) for trial in trials]
+
+
+def summarise(trials: Sequence[Row]) -> Row:
+    """Return the counts of trials that share terrain and policy."""
+    count = Counter(trial["outcome"] for trial in trials)
+    low, high = wilson_interval(count["reached"], len(trials))
+    return {
+        "terrain": trials[0]["terrain"],
+        "policy": trials[0]["policy"],
+        "trials": len(trials),
+        "successes": count["reached"],
+        "ci95": [round(low, 4), round(high, 4)],
+        "failures": {reason: count[reason] for reason in ("no_route", "fell", "timeout")},
+    }
+
+
+def by_cell(trials: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Sort trials by terrain and policy, in the order in which they first appear."""
+    cells: dict[tuple[str, str], list[Row]] = {}
+    for trial in trials:
+        cells.setdefault((trial["terrain"], trial["policy"]), []).append(trial)
+    return cells
+
+
+def evaluate(
+    config: TrialsConfig, command: str, terrains: Sequence[str], policies: Sequence[str]
+) -> list[Row]:
+    """Return a row for every terrain and policy; the same for any number of workers.
+
+    Raises `ReportError` if `config.part` leaves tasks to others.
+    """
+    run = collect(
+        make_tasks(config, terrains, policies),
+        _settings(config, command, terrains, policies),
+        config,
+    )
+    if not run.complete:
+        raise ReportError(f"{run}: give the other parts' folders to `merge` for the table")
+    return _summaries(run.rows, terrains, policies)
+
+
+def run_and_report(
+    config: TrialsConfig,
+    command: str,
+    *,
+    title: str,
+    terrains: Sequence[str],
+    policies: Sequence[str],
+    table: Callable[[Sequence[Row]], str],
+) -> int:
+    """Estimate, evaluate, print the table (made of all trials) and write what was asked for."""
+    began = time.time()
+    if config.json:
+        check_writable(config.json)
+    tasks = make_tasks(config, terrains, policies)
+    settings = _settings(config, command, terrains, policies)
+    left = len(tasks) - len(finished(tasks, settings, config))
+    if left:
+        cost = estimate(
+            config.load_zoo(),
+            [make_ground(config, terrain, 0).terrain for terrain in terrains],
+            grounds=config.grounds,
+            episodes=config.count * len(policies),
+        )
+        # How many cores a cluster will give is not known before it does.
+        cores = 1 if config.ray else config.workers or os.cpu_count() or 1
+        print(f"{left} of {len(tasks)} tasks to do; all of them: {cost.on(cores)}", flush=True)
+    run = collect(tasks, settings, config, progress=True)
+    if not run.complete:
+        print(f"{run}; give the other parts' folders to --merge for the table")
+        return 0
+    rows = _summaries(run.rows, terrains, policies)
+    text = table(run.rows)
+    caption = (
+        f"Success in % with 95 % intervals, {config.count:,} trials a cell; robot {config.robot}, "
+        f"protocol {config.protocol}, tau {config.taus}, switch cost {config.switch_cost:g}, "
+        f"seed {config.seed}."
+    )
+    print(f"{text}\n\n{caption}")
+    if config.json:
+        write_json(config.json, rows)
+        print(f"rows -> {config.json}")
+    if config.out:
+        groups: dict[str, dict[str, Share]] = {}
+        for row in rows:
+            share = Share(successes=row["successes"], trials=row["trials"])
+            groups.setdefault(row["terrain"], {})[row["policy"]] = share
+        chart = share_chart(groups, title)
+        write_report(
+            config.out,
+            run,
+            title=title,
+            table=text,
+            caption=caption,
+            settings=settings,
+            began=began,
+            figures={"success.svg": lambda path: path.write_text(chart)},
+        )
+        print(f"report -> {config.out}")
+    return 0
+
+
+def _settings(
+    config: TrialsConfig, command: str, terrains: Sequence[str], policies: Sequence[str]
+) -> dict[str, Any]:
+    return settings_of(
+        config,
+        command,
+        terrains=terrains,
+        policies=policies,
+        trials=config.count,
+        zoo=config.zoo_digests(),
+    )
+
+
+def _summaries(
+    trials: Sequence[Row], terrains: Sequence[str], policies: Sequence[str]
+) -> list[Row]:
+    """Return one row a terrain and policy, in the order asked for."""
+    cells = by_cell(trials)
+    return [summarise(cells[terrain, policy]) for terrain in terrains for policy in policies]

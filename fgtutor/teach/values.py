@@ -1,0 +1,176 @@
+"""Plain values: how answers travel from one process to another, and how two of them differ.
+
+Reads numbers, text, arrays and lists of these; gives JSON, never a pickle, and text that shows what
+differs. What does not reduce to plain numbers is refused, so an object with opinions about `==` is
+an array by the time anything is compared.
+"""
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fgtutor.errors import ConfigError
+
+LARGEST = 400_000
+"""Most bytes of numbers in one answer."""
+DEEPEST = 4
+"""Lists within lists in one answer: enough for any, and no recursion to exhaust."""
+ROWS = 5
+"""Differing values shown in a table."""
+PICTURE = 64, 20
+"""Largest picture of where an array differs, columns and rows of text."""
+_DTYPES = {"b": "bool", "i": "int64", "u": "int64", "f": "float64"}
+
+
+def encode(value: Any, room: int = DEEPEST) -> Any:
+    """Return a value as JSON can hold it; raises `ConfigError` if it is not a plain one."""
+    if _is_plain(value):
+        return value
+    if isinstance(value, tuple | list):
+        if not room:
+            raise ConfigError(f"lists within lists, more than {DEEPEST} deep")
+        kind = "tuple" if isinstance(value, tuple) else "list"
+        return {kind: [encode(item, room - 1) for item in value]}
+    try:
+        array = np.asarray(value)
+    except Exception as error:  # whatever a foreign object's own conversion raises
+        raise ConfigError(f"a {_kind(value)} that is no array: {error!r:.80}") from error
+    if array.dtype.kind not in _DTYPES:
+        raise ConfigError(f"a {_kind(value)}, not numbers: return arrays or numbers")
+    array = np.ascontiguousarray(array, dtype=_DTYPES[array.dtype.kind]).reshape(array.shape)
+    if array.nbytes > LARGEST:
+        raise ConfigError(f"an array of shape {array.shape}, larger than any answer should be")
+    data = base64.b64encode(array.tobytes()).decode()
+    return {"array": [array.dtype.name, list(array.shape), data]}
+
+
+def decode(data: Any, room: int = DEEPEST) -> Any:
+    """Return what `encode` was given; raises `ConfigError` for what it cannot have made."""
+    if _is_plain(data):
+        return data
+    try:
+        ((kind, content),) = data.items()
+        if kind in ("tuple", "list") and room:
+            items = [decode(item, room - 1) for item in content]
+            return tuple(items) if kind == "tuple" else items
+        name, shape, text = content
+        if kind != "array" or name not in _DTYPES.values():
+            raise ValueError(f"neither a shallow list nor an array of numbers: {kind!r:.40}")
+        return np.frombuffer(base64.b64decode(text), dtype=name).reshape(shape).copy()
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ConfigError(f"not an encoded value ({error})") from error
+
+
+def difference(
+    expected: Any, got: Any, *, rtol: float = 1e-5, atol: float = 1e-8, show: bool = True
+) -> str:
+    """Say how `got` differs from `expected`: a table and, for maps, a picture; "" if it does not.
+
+    Integers, floats and booleans of one value are the same, and so are a number and an array that
+    holds only it. Without `show` the expected values stay secret.
+    """
+    if isinstance(expected, tuple):
+        items = list(got) if isinstance(got, Sequence) or np.ndim(got) else []
+        if len(items) != len(expected):
+            return f"Expected {len(expected)} values, got {describe(got)}."
+        for i, (one, other) in enumerate(zip(expected, items, strict=True)):
+            text = difference(one, other, rtol=rtol, atol=atol, show=show)
+            if text:
+                return f"In value {i + 1} of the {len(expected)} returned:\n{text}"
+        return ""
+    wanted, array = np.asarray(expected), _numbers(got)
+    if got is None:
+        return "The function returned None: does it end with `return`?"
+    if array is None:
+        return f"Expected {describe(expected)}, got {describe(got)}."
+    if wanted.ndim == 0 and array.size == 1:
+        array = array.reshape(())
+    if array.shape != wanted.shape:
+        turned = sorted(array.shape) == sorted(wanted.shape)
+        advice = ": are two axes swapped?" if turned else "."
+        return f"Expected {describe(expected)}, got {describe(got)}{advice}"
+    wrong = ~np.isclose(array, wanted, rtol=rtol, atol=atol, equal_nan=True)
+    if not wrong.any():
+        return ""
+    if not show:
+        return f"Got {_number(array[wrong][0])}."
+    return _table(wanted, array, wrong) + _picture(wrong)
+
+
+def describe(value: Any) -> str:
+    """Return what kind of value this is, in few words."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    if isinstance(value, tuple | list):
+        inside = ", ".join(describe(item) for item in value[:3]) + ", ..." * (len(value) > 3)
+        return f"{len(value)} values ({inside})" if value else "an empty list"
+    if isinstance(value, str):
+        return f"the text {value[:40]!r}"
+    if isinstance(value, bool | int | float | np.generic):
+        return f"the number {_number(value)}"
+    return _kind(value)
+
+
+def _is_plain(value: Any) -> bool:
+    """Return whether JSON holds a value as it is; an integer only if 64 bits hold it."""
+    if isinstance(value, int):
+        return -(2**63) <= value < 2**63
+    return value is None or isinstance(value, float | str)
+
+
+def _kind(value: Any) -> str:
+    return "nothing (None)" if value is None else type(value).__name__
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    """Return a value as an array of numbers, or None if it is not one."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        return None
+    return array if array.dtype.kind in _DTYPES else None
+
+
+def _number(value: Any, digits: int = 4) -> str:
+    return str(value) if isinstance(value, bool | np.bool_) else f"{value:.{digits}g}"
+
+
+def _table(wanted: np.ndarray, array: np.ndarray, wrong: np.ndarray) -> str:
+    """List the first values that differ."""
+    if wanted.ndim == 0:
+        rows = [("", _number(wanted[()]), _number(array[()]))]
+        if rows[0][1] == rows[0][2]:
+            rows = [("", _number(wanted[()], 10), _number(array[()], 10))]
+        head = ""
+    else:
+        rows = []
+        for index in np.argwhere(wrong)[:ROWS].tolist():
+            pair = wanted[tuple(index)], array[tuple(index)]
+            texts = [_number(value) for value in pair]
+            if texts[0] == texts[1]:
+                texts = [_number(value, 10) for value in pair]
+            rows.append((str(index), *texts))
+        head = f"{wrong.sum()} of {wrong.size} values differ" + (
+            f", the first {ROWS}:\n" if wrong.sum() > ROWS else ":\n"
+        )
+    lines = [("where" if wanted.ndim else "", "expected", "got"), *rows]
+    wide = [max(len(line[column]) for line in lines) for column in range(3)]
+    return head + "\n".join(
+        "  ".join(text.ljust(width) for text, width in zip(line, wide, strict=True)).rstrip()
+        for line in lines
+    )
+
+
+def _picture(wrong: np.ndarray) -> str:
+    """Draw which cells of a map differ, x to the right and y up; nothing for small arrays."""
+    if wrong.ndim < 2 or min(wrong.shape[:2]) < 3:
+        return ""
+    layers = wrong.reshape(*wrong.shape[:2], -1)
+    worst = int(layers.sum(axis=(0, 1)).argmax())
+    plane = layers[: PICTURE[0], : PICTURE[1], worst]
+    # Text runs row by row from above: transpose, highest y first.
+    rows = ["".join("x" if cell else "." for cell in row) for row in plane.T[::-1]]
+    which = f" [:, :, {worst}]" if wrong.ndim == 3 else ""
+    return f"\nwrong cells{which} (x), first axis to the right, second up:\n" + "\n".join(rows)

@@ -1,0 +1,115 @@
+"""The process of one submission: run its cells, ask its functions, send back plain values.
+
+Reads a job as JSON from stdin; gives one JSON line a question on stdout. Started by `sandbox`, with
+nothing inherited. What it sends is not trusted by anyone: no verdict is made here.
+"""
+
+import importlib
+import json
+import linecache
+import os
+import sys
+import time
+import types
+from typing import Any, BinaryIO
+
+from fgtutor.teach.asking import CRASHED, NOT_STARTED, TOO_SLOW, TooSlow, ask, explain, time_limit
+from fgtutor.teach.confinement import confine
+from fgtutor.teach.values import decode
+
+OFFERED = ("fgtutor.directions",)
+"""Modules of ours that a submission may import; they load neither torch nor a simulator."""
+
+
+def main() -> None:
+    """Do the job on stdin, then leave without running anything that the submission left behind."""
+    job = json.loads(sys.stdin.buffer.read())
+    answers = os.fdopen(os.dup(1), "wb")
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(null, stream)
+    seconds, loading = job["seconds"], job["loading"]
+    for name in OFFERED:  # before the door closes
+        importlib.import_module(name)
+    in_force = confine(
+        memory_mb=job["memory_mb"],
+        cpu_seconds=loading + len(job["questions"]) * (seconds + 1) + 1,
+    )
+    send(answers, {"confined": in_force})
+    namespace, faults = load(job["cells"], loading)
+    send(answers, {"loaded": True})
+    for question in job["questions"]:
+        cases = question["cases"]
+        arguments = None if cases is None else [decode(case) for case in cases]
+        reply = answer(namespace, faults, question["name"], arguments, seconds)
+        send(answers, {"question": question["id"], **reply})
+    os._exit(0)
+
+
+def send(answers: BinaryIO, message: dict[str, Any]) -> None:
+    """Write one line."""
+    answers.write(json.dumps(message).encode() + b"\n")
+    answers.flush()
+
+
+def load(cells: list[str], seconds: float) -> tuple[dict[str, Any], list[tuple[str, dict]]]:
+    """Run all cells in order; return what they define, and (source, reply) of each that failed.
+
+    A failing cell does not stop the others, as in a notebook. All share `seconds` of CPU time.
+    """
+    stub_checks()
+    module = types.ModuleType("__main__")
+    module.__dict__["display"] = lambda *values, **options: None
+    sys.modules["__main__"] = module
+    faults = []
+    end = time.process_time() + seconds
+    for number, source in enumerate(cells):
+        name = f"<cell {number + 1}>"
+        linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
+        try:
+            with time_limit(max(end - time.process_time(), 0.2)):
+                exec(compiled(source, name), module.__dict__)
+        except TooSlow:
+            detail = f"cell {number + 1} runs on and on, and was stopped"
+            faults.append((source, {"outcome": TOO_SLOW, "detail": detail}))
+        except BaseException as error:
+            detail = f"cell {number + 1}: {explain(error, name)}"
+            faults.append((source, {"outcome": CRASHED, "detail": detail}))
+    return module.__dict__, faults
+
+
+def compiled(source: str, name: str) -> types.CodeType:
+    """Compile a cell, without the lines that only IPython understands (%magic and !command)."""
+    try:
+        return compile(source, name, "exec")
+    except SyntaxError:
+        lines = source.splitlines()
+        kept = ["" if line.lstrip().startswith(("%", "!")) else line for line in lines]
+        return compile("\n".join(kept), name, "exec")
+
+
+def stub_checks() -> None:
+    """Offer `check`, `hint` and `solution` that do nothing: a submission is asked from outside."""
+    checks = types.ModuleType("fgtutor.teach.checks")
+    for name in ("check", "hint", "solution"):
+        checks.__dict__[name] = lambda *values, **options: None
+    sys.modules["fgtutor.teach.checks"] = checks
+
+
+def answer(
+    namespace: dict[str, Any],
+    faults: list[tuple[str, dict]],
+    name: str,
+    cases: list[tuple] | None,
+    seconds: float,
+) -> dict[str, Any]:
+    """Ask one question; where the name is missing, say which failing cell should have given it."""
+    if name not in namespace:
+        for source, reply in faults:
+            if name in source:
+                return reply
+        return {"outcome": NOT_STARTED, "detail": f"the notebook defines no `{name}`"}
+    try:
+        return ask(namespace[name], cases, seconds)
+    except BaseException as error:  # whatever a submission raises to get out of here
+        return {"outcome": CRASHED, "detail": type(error).__name__}

@@ -1,0 +1,131 @@
+# %% [markdown]
+# # Exercise 02 · A robot that falls
+#
+# **You will be able to** compute the tracking reward, turn a rollout into labels that do not hide a
+# fall, and write the two formulas at PPO's heart.
+#
+# About 35 minutes. Needs notebook 02, numpy, and no GPU.
+#
+# Write each function below its question, then run its `check`; `hint("ex02.q1")` gives one more
+# hint at each call, and `solution("ex02.q1")` opens once the check has passed.
+
+# %%
+import numpy as np
+
+from fgtutor.teach.checks import check, hint, solution
+
+# %% [markdown]
+# ## ex02.q1
+#
+# The paper's Eq. 1 rewards a robot that moves as it was told:
+#
+# $$r_v = \exp\left(-\frac{\lVert v - \hat v \rVert_2}{\sigma}\right), \qquad \sigma = 0.25
+# \text{ m/s}.$$
+#
+# It is the norm, not its square: an error of 0.25 m/s leaves $1/e \approx 0.37$, one of 0.05 m/s
+# already costs 18 %. Velocities are planar, `[n, 2]`: one row a robot.
+
+
+# %%
+def tracking_reward(velocity, command):
+    """Return r_v of every robot, [n]."""
+    # BEGIN SOLUTION
+    return np.exp(-np.linalg.norm(velocity - command, axis=-1) / 0.25)
+    # END SOLUTION
+
+
+# %%
+check("ex02.q1", tracking_reward)
+
+# %%
+hint("ex02.q1")
+
+# %% [markdown]
+# ## ex02.q2
+#
+# A Feasibility-Net learns to predict $r_v$ on a patch. The label of step $t$ is the mean of `r_v`
+# over the next `window` steps, from $t$ on. `fell` is True from the step of the fall to the end,
+# and a robot on its back has $r_v = 0$, whatever the simulator says.
+#
+# Why not leave out the steps after the fall? Suppose a robot runs perfectly up to a gap and falls
+# in. Averaged over the steps it survived, the label in front of the gap is 1: feasible!
+#
+# At the end of the rollout the window is shorter: take the mean of what is left.
+
+
+# %%
+def labels(r_v, fell, window):
+    """Return the label of every step, [T]."""
+    # BEGIN SOLUTION
+    counted = np.where(fell, 0.0, r_v)
+    return np.array([counted[t : t + window].mean() for t in range(len(counted))])
+    # END SOLUTION
+
+
+# %%
+check("ex02.q2", labels)
+
+# %% [markdown]
+# ## ex02.q3
+#
+# What was a step worth? Its own reward, and what came after it, each step later counting $\gamma$
+# times less: $G_t = r_t + \gamma\, G_{t+1}$. A rollout holds several episodes in a row; `done[t]`
+# marks the last step of one. What follows belongs to the next episode, so there $G_t = r_t$. At the
+# end of the rollout too.
+#
+# With rewards (1, 1, 1), $\gamma = 0.5$ and no end: $G = (1.75, 1.5, 1)$. With done after the
+# second: $G = (1.5, 1, 1)$.
+
+
+# %%
+def discounted_returns(rewards, done, gamma):
+    """Return G of every step, [T]."""
+    # BEGIN SOLUTION
+    returns, following = np.zeros(len(rewards)), 0.0
+    for t in reversed(range(len(rewards))):
+        following = rewards[t] + gamma * following * (not done[t])
+        returns[t] = following
+    return returns
+    # END SOLUTION
+
+
+# %%
+check("ex02.q3", discounted_returns)
+
+# %% [markdown]
+# ## ex02.q4
+#
+# PPO raises the probability of actions that went better than expected (advantage $A > 0$) and
+# lowers that of the others. `ratio` is new probability over old. So that one rollout cannot carry
+# the policy far away, gain beyond a ratio of $1 \pm \epsilon$ does not count:
+#
+# $$L = \operatorname{mean}\bigl(\min(\rho A,\ \operatorname{clip}(\rho, 1 - \epsilon, 1 + \epsilon)
+# A)\bigr).$$
+#
+# Work out $\rho = 2$, $\epsilon = 0.2$ for $A = 1$ and for $A = -1$ by hand before you write it.
+# What would be lost without the min?
+
+
+# %%
+def clipped_objective(ratio, advantage, epsilon):
+    """Return PPO's clipped objective, a number."""
+    # BEGIN SOLUTION
+    clipped = np.clip(ratio, 1 - epsilon, 1 + epsilon)
+    # rho = 2: A = 1 gives min(2, 1.2) = 1.2, A = -1 gives min(-2, -1.2) = -2. Clipped alone, an
+    # action that became twice as likely although it was bad would cost only 1.2, and cost no more
+    # however likely it became: there would be no way back.
+    return np.minimum(ratio * advantage, clipped * advantage).mean()
+    # END SOLUTION
+
+
+# %%
+check("ex02.q4", clipped_objective)
+
+# %% [markdown]
+# ## What to try
+#
+# - Plot `labels` for a fall at step 30 of 60 and windows of 1, 10 and 25 steps. What does the
+#   paper's label (a window of 1) say one step before the fall?
+
+# %%
+solution("ex02.q4")

@@ -1,0 +1,106 @@
+# %% [markdown]
+# # Exercise 04 · Have I seen this before?
+#
+# **You will be able to** turn a reconstruction loss into a weight, choose its thresholds from data,
+# and say when a place closes.
+#
+# About 25 minutes. Needs notebook 04, numpy, and no GPU.
+#
+# Write each function below its question, then run its `check`; `hint("ex04.q1")` gives one more
+# hint at each call, and `solution("ex04.q1")` opens once the check has passed.
+
+# %%
+import numpy as np
+
+from fgtutor.teach.checks import check, hint, solution
+
+# %% [markdown]
+# ## ex04.q1
+#
+# A VAE that has seen only steps paints steps. How badly it repaints a patch says how foreign the
+# patch is: $L_{recon}$ is the **sum** over the patch's points of the squared error. Units matter,
+# or thresholds like 0.1 and 2.0 mean nothing: the network sees `height_scale * patch` (at a scale
+# of 4, a unit is a quarter of a metre), and `decoded` is in those units already.
+
+
+# %%
+def reconstruction_loss(patch, decoded, height_scale):
+    """Return L_recon of every patch, [n]; patch [n, points] in metres, decoded in scaled units."""
+    # BEGIN SOLUTION
+    return ((height_scale * patch - decoded) ** 2).sum(axis=-1)
+    # END SOLUTION
+
+
+# %%
+check("ex04.q1", reconstruction_loss)
+
+# %%
+hint("ex04.q1")
+
+# %% [markdown]
+# ## ex04.q2
+#
+# Eq. 4 makes a weight of the loss:
+#
+# $$w_{ood} = \operatorname{clip}\left(1 - \frac{L_{recon} - \tau_{low}}{\tau_{high} - \tau_{low}},\
+# 0,\ 1\right).$$
+#
+# Below $\tau_{low}$ the terrain is as good as known, above $\tau_{high}$ the net's prediction is
+# not believed at all. Half way between, at 1.05 with the paper's 0.1 and 2.0, it is believed by
+# half.
+
+
+# %%
+def ood_weight(loss, tau_low, tau_high):
+    """Return w_ood, an array of the loss's shape."""
+    # BEGIN SOLUTION
+    return np.clip(1 - (loss - tau_low) / (tau_high - tau_low), 0, 1)
+    # END SOLUTION
+
+
+# %%
+check("ex04.q2", ood_weight)
+
+# %% [markdown]
+# ## ex04.q3
+#
+# The paper's thresholds suit the paper's networks. A specialist of ours also remembers how well it
+# reconstructs **its own** training terrain; thresholds can be read off that: $\tau_{low}$ is the
+# loss that 90 % of the own patches stay below, $\tau_{high}$ the one that 95 % stay below.
+
+
+# %%
+def calibrated_taus(losses):
+    """Return (tau_low, tau_high) from the losses [n] on a specialist's own terrain."""
+    # BEGIN SOLUTION
+    return np.quantile(losses, 0.9), np.quantile(losses, 0.95)
+    # END SOLUTION
+
+
+# %%
+check("ex04.q3", calibrated_taus)
+
+# %% [markdown]
+# ## ex04.q4
+#
+# A judgement, with a number. On a certain patch the net predicts $f = 0.9$. The planner uses
+# $F = w_{ood} f$ and closes an edge where $F < f_{min} = 0.1$. With the paper's thresholds 0.1 and
+# 2.0: up to which $L_{recon}$ does the place stay open? (Half a percent off is close enough.)
+
+# %%
+# BEGIN SOLUTION
+# F = 0.1 needs w_ood = 0.1 / 0.9 = 1/9; solve 1 - (L - 0.1) / 1.9 = 1/9 for L.
+largest_loss = 0.1 + 1.9 * (1 - 0.1 / 0.9)
+# END SOLUTION
+
+# %%
+check("ex04.q4", largest_loss)
+
+# %% [markdown]
+# ## What to try
+#
+# - With thresholds from `calibrated_taus`, which share of its own terrain does a specialist
+#   distrust? Is that too careful?
+
+# %%
+solution("ex04.q4")

@@ -1,0 +1,118 @@
+# %% [markdown]
+# # Exercise 08 · Meet the A1
+#
+# **You will be able to** turn actions into torques, tell which way is down from a quaternion,
+# mirror the robot, and add up its rewards.
+#
+# About 35 minutes. Needs notebook 08, numpy, and no GPU.
+#
+# Write each function below its question, then run its `check`; `hint("ex08.q1")` gives one more
+# hint at each call, and `solution("ex08.q1")` opens once the check has passed.
+
+# %%
+import numpy as np
+
+from fgtutor.teach.checks import check, hint, solution
+
+# %% [markdown]
+# ## ex08.q1
+#
+# The policy does not command torques. Its action moves the **target** of a spring and damper in
+# each joint: target = stance + 0.5 action (rad), and
+#
+# $$\tau = k_p (\text{target} - q) - k_d\, \dot q, \qquad k_p = 35 \text{ N m/rad}, \quad k_d = 0.5
+# \text{ N m s/rad},$$
+#
+# at most 33.5 N m either way. So an action of zero stands, and a blow is answered in the next
+# millisecond, long before the policy hears of it.
+
+
+# %%
+def joint_torques(q, dq, action, stance):
+    """Return the torques, N m; all arrays are [12]."""
+    # BEGIN SOLUTION
+    target = stance + 0.5 * action
+    return np.clip(35.0 * (target - q) - 0.5 * dq, -33.5, 33.5)
+    # END SOLUTION
+
+
+# %%
+check("ex08.q1", joint_torques)
+
+# %%
+hint("ex08.q1")
+
+# %% [markdown]
+# ## ex08.q2
+#
+# A policy should not need to know where north is, but it must know which way is down. So it
+# observes the direction of gravity in the trunk's own frame: $R^\top (0, 0, -1)$, where $R$ turns
+# vectors of the trunk into the world. MuJoCo gives the posture as a quaternion $(w, x, y, z)$ of
+# length 1, and the third row of $R$ is
+#
+# $$\bigl(2 (xz - wy),\quad 2 (yz + wx),\quad 1 - 2 (x^2 + y^2)\bigr).$$
+
+
+# %%
+def gravity_in_body(quaternion):
+    """Return the direction of gravity in the trunk's frame, [n, 3]; quaternion is [n, 4]."""
+    # BEGIN SOLUTION
+    w, x, y, z = quaternion.T
+    # R^T (0, 0, -1) is minus the third column of R^T, which is the third row of R.
+    return -np.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)), axis=-1)
+    # END SOLUTION
+
+
+# %%
+check("ex08.q2", gravity_in_body)
+
+# %% [markdown]
+# ## ex08.q3
+#
+# The A1 is its own mirror image, so half of what it learns on one side it should know on the other.
+# Joints come as FR, FL, RR, RL (front/rear, right/left), and in each leg hip, thigh, calf. In the
+# mirror, left and right legs change places, and a hip that swings outwards to the left swings
+# outwards to the right: its angle changes sign. Thighs and calves bend forwards and backwards:
+# theirs does not.
+
+
+# %%
+def mirrored(joints):
+    """Return the joint angles [n, 12] of the mirrored robot."""
+    # BEGIN SOLUTION
+    legs = joints.reshape(-1, 4, 3)[:, [1, 0, 3, 2]]
+    return (legs * (-1.0, 1.0, 1.0)).reshape(-1, 12)
+    # END SOLUTION
+
+
+# %%
+check("ex08.q3", mirrored)
+
+# %% [markdown]
+# ## ex08.q4
+#
+# A reward is a weighted sum of terms: tracking and gait earn, bouncing and jerking cost. Weights
+# are per second, a control step lasts `dt`. And the sum is floored at zero. Otherwise a robot for
+# which every step costs more than it earns would soon find out how to end the costs: by falling
+# over.
+
+
+# %%
+def reward(terms, weights, dt):
+    """Return the reward of every robot in this step, [n]; terms is [n, k], weights [k]."""
+    # BEGIN SOLUTION
+    return np.maximum(terms @ weights, 0.0) * dt
+    # END SOLUTION
+
+
+# %%
+check("ex08.q4", reward)
+
+# %% [markdown]
+# ## What to try
+#
+# - How far from its target must a joint be for the spring alone to reach the torque limit? How
+#   large an action is that?
+
+# %%
+solution("ex08.q4")

@@ -1,0 +1,216 @@
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from fgtutor.baselines import (
+    OccupancyConfig,
+    TraversabilityConfig,
+    View,
+    classical,
+    classical_switched,
+    find_route,
+    occupancy,
+    ours,
+    planners,
+    single,
+    traversability,
+    without_fusion,
+    without_heading,
+    without_ood,
+)
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError, PlanningError
+from fgtutor.tensorization import Assessment, tensorize
+
+RADIUS = 0.1
+
+
+def ground(heights, resolution=0.1):
+    return ElevationMap(np.asarray(heights, dtype=float), resolution=resolution)
+
+
+def ramp(slope, shape=(12, 9), resolution=0.1):
+    x = (np.arange(shape[0]) + 0.5) * resolution
+    return ground(np.repeat(slope * x[:, None], shape[1], axis=1), resolution)
+
+
+def wall(height, n=15):
+    """A low place and a high one, the edge between cells 7 and 8 along x."""
+    return ground(np.repeat(np.where(np.arange(n) < 8, 0.0, height)[:, None], 11, axis=1))
+
+
+def test_flat_ground_is_wholly_traversable_and_free():
+    flat = ground(np.full((9, 7), 3.0))
+    assert traversability(flat, RADIUS) == pytest.approx(np.ones((9, 7)))
+    assert occupancy(flat, RADIUS).tolist() == np.ones((9, 7)).tolist()
+
+
+def test_a_ramp_costs_its_slope_only():
+    # A rise of 0.5 m a metre is atan 0.5 = 0.4636 rad of the critical 1.0; a plane is not rough,
+    # and its steps of 0.1 m over a window of three cells are not critical: (0.5364 + 1 + 1) / 3.
+    inner = traversability(ramp(0.5), RADIUS)[3:-3, 3:-3]
+    assert inner == pytest.approx(np.full(inner.shape, (1 - math.atan(0.5) + 2) / 3))
+
+
+def test_a_slope_beyond_the_critical_one_is_closed():
+    assert traversability(ramp(2.0), RADIUS)[3:-3, 3:-3].max() == 0  # atan 2 = 1.107 rad
+
+
+def test_roughness_by_hand():
+    # One cell 0.03 m above eight others: the mean is 0.03 / 9 and the sum of squared deviations
+    # 0.03^2 - 9 (0.03 / 9)^2 = 0.0008. The plane there is level, so the standard deviation is
+    # sqrt(0.0008 / 8) = 0.01 m, a fifth of the critical 0.05.
+    heights = np.zeros((9, 9))
+    heights[4, 4] = 0.03
+    alone = traversability(ground(heights), radius=0.0)
+    assert alone[4, 4] == pytest.approx((1 + 1 + 0.8) / 3)
+    # For its neighbour along x the plane leans by 0.03 * 0.1 / 0.06 = 0.05, and explains 0.05^2 *
+    # 0.06 = 0.00015 of the 0.0008; distances along the normal are shorter by cos atan 0.05.
+    deviation = math.sqrt(0.00065 / 8 / (1 + 0.05**2))
+    assert alone[5, 4] == pytest.approx((1 - math.atan(0.05) + 1 + 1 - deviation / 0.05) / 3)
+
+
+def test_a_high_step_closes_the_cells_beside_it_and_a_low_one_does_not():
+    high = traversability(wall(0.20), radius=0.0)
+    # Cells 7 and 8 have the edge in their window. Cells 6 and 9 have three such neighbours, one
+    # less than the critical four: 3/4 * 0.20 = 0.15 m, which still exceeds the critical 0.12.
+    assert (high[:, 5] == 0).nonzero()[0].tolist() == [6, 7, 8, 9]
+    low = traversability(wall(0.10), radius=0.0)
+    assert (low > 0.5).all()
+
+
+def test_a_wider_robot_keeps_further_away():
+    assert (traversability(wall(0.20), radius=0.2)[:, 5] == 0).nonzero()[0].tolist() == [
+        *range(4, 12)
+    ]
+
+
+def test_classical_costs_rotate_with_the_map():
+    rng = np.random.default_rng(0)
+    rough = ground(rng.random((12, 9)) * 0.1)
+    for cells in (traversability, occupancy):
+        turned = cells(rough.rotated90(), 0.15)
+        assert turned == pytest.approx(np.rot90(cells(rough, 0.15)))
+
+
+def test_inflation_by_hand():
+    # Cells 7 and 8 are lethal. Cell 6 is 0.1 m away, at the inscribed radius: closed. Cell 5 at
+    # 0.2 m: 252 exp(-10 * 0.1) = 92.7, F = 50 / (50 + 0.8 * 92.7); cell 1 at 0.6 m: beyond 0.55.
+    inflated = occupancy(wall(0.16), radius=0.1)[:, 5]
+    assert inflated[6:10].tolist() == [0, 0, 0, 0]
+    assert inflated[5] == inflated[10] == pytest.approx(50 / (50 + 0.8 * 252 * math.exp(-1)))
+    assert inflated[2] == pytest.approx(50 / (50 + 0.8 * 252 * math.exp(-4)))
+    assert inflated[1] == 1
+    assert occupancy(wall(0.10), radius=0.1).min() == 1  # no obstacle at all
+
+
+def test_thresholds_are_settings():
+    strict = TraversabilityConfig(step=0.05)
+    assert traversability(wall(0.10), RADIUS, strict).min() == 0
+    assert occupancy(wall(0.10), RADIUS, OccupancyConfig(step=0.05)).min() == 0
+
+
+@pytest.fixture
+def view(make_specialist):
+    """Three untrained policies on bumpy ground with one unknown cell."""
+    rng = np.random.default_rng(1)
+    heights = rng.random((10, 8)) * 0.05
+    heights[2, 3] = np.nan
+    zoo = {name: make_specialist(name, seed=i) for i, name in enumerate(("gaps", "steps"))}
+    zoo["general"] = make_specialist("general", seed=7)
+    return View(ground(heights), zoo, "calibrated")
+
+
+def test_a_view_gives_what_tensorize_gives_and_computes_it_once(view, monkeypatch):
+    for name, specialist in view.zoo.items():
+        expected = tensorize(view.elevation, specialist, taus="calibrated")
+        assert torch.equal(view.tensor(name), expected)
+    monkeypatch.setattr("fgtutor.baselines.assess", None)  # a second call would fail
+    assert view.f("steps").shape == (10, 8, 8)
+    assert view.specialists == ["gaps", "steps"]
+    assert view.radius == 0.1
+
+
+def analytic(view, f, reconstruction):
+    """Let the view believe constants instead of its networks."""
+    for name in view.zoo:
+        numbers = f[name].expand(10, 8, 8).clone(), reconstruction[name].expand(10, 8, 8).clone()
+        view._known[name] = Assessment(*numbers)
+    return view
+
+
+@pytest.fixture
+def known(view):
+    """gaps: f 0.9 but unfamiliar (w_ood = 0.5); steps: f 0.8 along +x only, else 0.4; familiar."""
+    flat = ground(np.zeros((10, 8)))
+    along_x = torch.full((8,), 0.4)
+    along_x[0] = 0.8
+    f = {"gaps": torch.tensor(0.9), "steps": along_x, "general": torch.tensor(0.6)}
+    # Eq. 4 with tau 1 and 3: a loss of 2 lies half way.
+    loss = {"gaps": torch.tensor(2.0), "steps": torch.tensor(0.0), "general": torch.tensor(0.0)}
+    return analytic(View(flat, view.zoo, (1.0, 3.0)), f, loss)
+
+
+def inner(layers, name):
+    """One cell in the middle of a layer, over the headings."""
+    return layers[name][5, 4].tolist()
+
+
+def test_parts_left_out_by_hand(known):
+    (fused,) = ours(known)
+    assert inner(fused, "gaps") == pytest.approx([0.45] * 8)
+    assert inner(fused, "steps") == pytest.approx([0.8] + [0.4] * 7)
+    (believed,) = without_ood(known)
+    assert inner(believed, "gaps") == pytest.approx([0.9] * 8)
+    (blind,) = without_heading(known)
+    # On the border headings that leave the map count as 0; in the middle (0.8 + 7 * 0.4) / 8.
+    assert inner(blind, "steps") == pytest.approx([0.45] * 8)
+    assert [list(layers) for layers in without_fusion(known)] == [["gaps"], ["steps"]]
+    (alone,) = single("general", known)
+    assert inner(alone, "general") == pytest.approx([0.6] * 8)
+
+
+def test_each_planner_drives_with_its_policies(known):
+    def drivers(planner, start=(0.15, 0.45), goal=(0.85, 0.45)):
+        route = find_route(planner, known, start, goal)
+        return [route.names[i] for i in route.policies], route.cost
+
+    # Along +x: steps at 0.8; without w_ood gaps believes 0.9.
+    assert drivers(ours) == (["steps"] * 7, pytest.approx(7 / 0.8))
+    assert drivers(without_ood) == (["gaps"] * 7, pytest.approx(7 / 0.9))
+    assert drivers(without_fusion) == (["steps"] * 7, pytest.approx(7 / 0.8))
+    # Back along -x: gaps at 0.45 beats 0.4; without fusion it is one policy, the cheaper one.
+    assert drivers(ours, (0.85, 0.45), (0.15, 0.45)) == (["gaps"] * 7, pytest.approx(7 / 0.45))
+    flat = partial(classical, traversability)
+    assert drivers(flat) == (["general"] * 7, pytest.approx(7.0))
+    # On a flat classical map a diagonal step costs as much as a straight one: any way will do, and
+    # P says who drives it.
+    switched = find_route(
+        partial(classical_switched, traversability), known, (0.15, 0.45), (0.85, 0.45)
+    )
+    wanted = ["gaps" if heading else "steps" for heading in switched.headings]
+    assert [switched.names[i] for i in switched.policies] == wanted
+    assert switched.cost == pytest.approx(7.0)
+
+
+def test_a_classical_map_refuses_what_a_specialist_crosses(known):
+    high = View(wall(0.16, n=10), known.zoo, known.taus, known._known)
+    steps = partial(single, "steps")
+    known._known["steps"] = Assessment(torch.full((10, 11, 8), 0.8), torch.zeros(10, 11, 8))
+    assert find_route(steps, high, (0.15, 0.5), (0.95, 0.5)).names == ("steps",)
+    with pytest.raises(PlanningError):
+        find_route(partial(classical, traversability), high, (0.15, 0.5), (0.95, 0.5))
+    with pytest.raises(PlanningError):
+        find_route(partial(classical, occupancy), high, (0.15, 0.5), (0.95, 0.5))
+
+
+def test_planners_are_those_that_the_zoo_allows(view):
+    everyone = list(planners(view.zoo))
+    assert everyone[:4] == ["gaps", "steps", "ours", "general"]
+    specialists = {name: view.zoo[name] for name in view.specialists}
+    assert set(everyone) - set(planners(specialists)) == {"general", "traversability", "occupancy"}
+    with pytest.raises(ConfigError, match="zoo is empty"):
+        find_route(without_fusion, View(view.elevation, {}), (0.1, 0.1), (0.5, 0.5))

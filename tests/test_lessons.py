@@ -1,0 +1,182 @@
+"""What the notebooks draw and drive: patches where they belong, honest charts, real drives."""
+
+import math
+
+import networkx
+import numpy as np
+import pytest
+import torch
+from matplotlib.image import AxesImage
+
+from fgtutor.elevation import ElevationMap
+from fgtutor.execution import FollowConfig, execute
+from fgtutor.patches import PatchGrid
+from fgtutor.planning import as_networkx
+from fgtutor.ppo import feasibility_labels
+from fgtutor.robots.toy import ToyEnv
+from fgtutor.teach import charts, lessons
+from fgtutor.terrain import World, make_terrain
+
+GRID = PatchGrid(ahead=0.4, behind=0.2, half_width=0.2)
+SHORT = FollowConfig(patience=1.0, grace=1.0)
+
+
+@pytest.fixture
+def ledge() -> ElevationMap:
+    """2 x 2 m, 0.2 m higher from x = 1 m on."""
+    heights = np.zeros((20, 20))
+    heights[10:] = 0.2
+    return ElevationMap(heights)
+
+
+def roll(observations) -> torch.Tensor:
+    return torch.zeros(len(observations), 4)
+
+
+def images(figure) -> list[np.ndarray]:
+    """Return every image in a figure, by axes from left to right and top to bottom."""
+    found = [(axes, image) for axes in figure.axes for image in axes.get_images()]
+    return [np.asarray(image.get_array()) for _, image in found if isinstance(image, AxesImage)]
+
+
+def png(figure) -> bytes:
+    return figure._repr_png_()
+
+
+# Patches ------------------------------------------------------------------------------------------
+
+
+def test_a_patch_looks_ahead_whichever_way_the_robot_faces(ledge):
+    up = lessons.patch_at(ledge, (0.75, 1.0, 0.0), GRID).reshape(GRID.shape)
+    down = lessons.patch_at(ledge, (1.25, 1.0, math.pi), GRID).reshape(GRID.shape)
+    # Rows run from 0.2 m behind to 0.4 m ahead; the ledge is 0.25 m ahead of both robots.
+    assert up[:, 2].tolist() == pytest.approx([0, 0, 0, 0, 0, 0.2, 0.2], abs=1e-6)
+    assert down[:, 2].tolist() == pytest.approx([0, 0, 0, 0, 0, -0.2, -0.2], abs=1e-6)
+
+
+def test_the_gallery_shows_ahead_on_the_right_and_left_above(ledge):
+    aside = lessons.patch_at(ledge, (0.85, 1.0, -math.pi / 2), GRID)  # the ledge is to its left
+    ahead = lessons.patch_at(ledge, (0.75, 1.0, 0.0), GRID)
+    left, right = images(lessons.patch_gallery([aside, ahead], GRID, ["a", "b"]))
+    assert left[-1].max() == pytest.approx(0.2, abs=1e-6) and abs(left[0]).max() < 1e-6
+    assert right[:, -1].max() == pytest.approx(0.2, abs=1e-6) and abs(right[:, 0]).max() < 1e-6
+
+
+def test_the_rose_puts_each_heading_at_its_side(ledge):
+    figure = lessons.patch_rose(ledge, 0.75, 1.0, GRID)
+    places = {axes.get_title(loc="left"): axes.get_position() for axes in figure.axes}
+    middle = places["the place on the map"]
+    assert places["heading 0: +x"].x0 > middle.x0 > places["heading 4: -x"].x0
+    assert places["heading 2: +y"].y0 > middle.y0 > places["heading 6: -y"].y0
+
+
+def test_heading_maps_are_upright_and_in_their_places(ledge):
+    tensor = np.zeros((20, 20, 8))
+    tensor[19, :, 0] = 1.0  # the last column of cells along x, heading +x
+    figure = lessons.heading_maps(tensor, ledge)
+    by_title = {axes.get_title(loc="left"): axes for axes in figure.axes}
+    shown = np.asarray(by_title["heading 0: +x"].get_images()[0].get_array())
+    assert shown[:, -1].min() == 1.0 and shown[:, :-1].max() == 0.0
+
+
+# Driving ------------------------------------------------------------------------------------------
+
+
+def test_a_plain_function_drives_straight_to_the_goal_on_flat_ground():
+    terrain = make_terrain("flat", robot="toy")
+    route = lessons.straight_route(terrain, "roll")
+    assert route.xy[0] == pytest.approx(terrain.start, abs=0.1)
+    assert route.xy[-1] == pytest.approx(terrain.goal, abs=0.1)
+    assert route.length == pytest.approx(terrain.goal[0] - terrain.start[0], abs=0.15)
+    episode = execute(route, terrain, {"roll": lessons.Scripted(roll)}, config=SHORT)
+    assert episode.success and set(episode.policies.tolist()) == {0}
+    assert png(lessons.draw_drive(episode, route, terrain.elevation))
+    assert png(charts.draw_tracking(episode, terrain, 0.85, np.ones(len(episode.poses))))
+
+
+@pytest.mark.filterwarnings("ignore::tqdm.TqdmWarning")
+def test_a_rollout_has_every_group_over_time():
+    env = ToyEnv(World([[make_terrain("steps", robot="toy")]]), 3)
+    rollout = lessons.collect(env, roll, seconds=0.4)
+    assert {name: tuple(v.shape[:2]) for name, v in rollout.items()} == dict.fromkeys(
+        ("policy", "patch", "command", "tracking"), (10, 3)
+    )
+    label, valid = feasibility_labels(rollout["tracking"], 4)
+    assert png(charts.draw_labels(rollout["tracking"][:, 0], label[:, 0], valid[:, 0], 0.04))
+
+
+# Graphs and routes --------------------------------------------------------------------------------
+
+
+def test_the_graph_has_an_arrow_for_every_edge_and_costs_on_the_path():
+    grid = ElevationMap(np.zeros((3, 2)))
+    fused = np.full((3, 2, 8), 0.5)
+    graph = as_networkx(fused, np.zeros((3, 2, 8), dtype=int))
+    path = networkx.dijkstra_path(graph, (0, 0), (2, 0))
+    figure = lessons.draw_graph(graph, grid, path, ("steps",))
+    axes = figure.axes[0]
+    arrows = [artist for artist in axes.collections if hasattr(artist, "U")]
+    assert len(arrows) == 1 and len(arrows[0].U) == graph.number_of_edges()
+    assert [text.get_text() for text in axes.texts] == ["2.00", "2.00"]  # 1 / 0.5, twice
+
+
+def test_routes_are_compared_and_a_missing_one_says_why():
+    terrain = make_terrain("flat", robot="toy")
+    routes = {"one": lessons.straight_route(terrain, "steps"), "none": "no route: the ridge"}
+    figure = lessons.compare_routes(terrain.elevation, routes)
+    captions = {axes.get_title(loc="left"): axes.get_xlabel() for axes in figure.axes}
+    assert captions["none"] == "no route: the ridge" and "m, policy" in captions["one"]
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["steps"]
+
+
+# Charts -------------------------------------------------------------------------------------------
+
+
+def test_a_policy_keeps_its_colour_and_strangers_take_turns():
+    assert charts.colours_of(["mine", "gaps"]) == [charts.LINES[0], charts.POLICY_COLOURS["gaps"]]
+
+
+def test_rates_show_wilson_intervals():
+    axes = charts.draw_rates({"steps": (9, 10)}, title="t").axes[0]
+    assert axes.patches[0].get_width() == pytest.approx(0.9)
+    # Wilson (1927), 9 of 10: 0.596 to 0.982
+    assert list(axes.lines[0].get_xdata()) == pytest.approx([0.596, 0.982], abs=1e-3)
+    assert "9 of 10" in [text.get_text() for text in axes.texts]
+
+
+def test_losses_are_shares_and_the_ramp_is_w_ood():
+    figure = charts.draw_losses(
+        {"steps": torch.logspace(-3, 1, 400)}, {"paper": (0.1, 2.0), "own": (0.05, 0.5)}
+    )
+    ramp = figure.axes[1].lines[0]
+    x, y = np.asarray(ramp.get_xdata()), np.asarray(ramp.get_ydata())
+    assert y[x < 0.1].min() == 1.0 and y[x > 2.0].max() == 0.0
+    assert np.interp(1.05, x, y) == pytest.approx(0.5, abs=0.02)  # half-way between the taus
+
+
+def test_a_table_shows_its_numbers_or_the_texts_given():
+    values = [[0.25, 1.0]]
+    words = {"title": "t", "caption": "c"}
+    plain = charts.draw_table(values, ["row"], ["a", "b"], **words)
+    assert [text.get_text() for text in plain.axes[0].texts] == ["0.25", "1.00"]
+    counted = charts.draw_table(values, ["row"], ["a", "b"], texts=[["1 of 4", "4 of 4"]], **words)
+    assert [text.get_text() for text in counted.axes[0].texts] == ["1 of 4", "4 of 4"]
+
+
+def test_the_live_curve_draws_at_once_then_now_and_then(monkeypatch):
+    shown = []
+
+    class Handle:
+        def update(self, figure):
+            shown.append(figure)
+
+    monkeypatch.setattr(
+        "IPython.display.display", lambda figure, **_: shown.append(figure) or Handle()
+    )
+    live = charts.LiveCurve(seconds=1000)
+    for iteration in (1, 2, 3):
+        live({"samples": iteration, "r_v": 0.5, "failed": 0.0, "row": 0.0})
+    assert len(shown) == 1  # the first row at once, the next after 1000 s
+    live.draw(live.rows[:2])
+    assert len(shown) == 2 and len(live.rows) == 3

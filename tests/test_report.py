@@ -1,0 +1,120 @@
+import importlib.util
+import json
+import re
+import time
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from fgtutor.errors import ReportError
+from fgtutor.evaluation.chart import share_chart
+from fgtutor.evaluation.report import Share, markdown, write_report
+from fgtutor.evaluation.runner import Result
+from fgtutor.evaluation.shards import Run
+
+SCRIPT = Path(__file__).parents[1] / "benchmarks" / "readme_table.py"
+ROWS = [{"seed": seed, "outcome": "reached", "length": 8.1} for seed in range(3)]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    results = (
+        Result(rows=ROWS[:2], seconds=2.0, machine={"cores": 2}),
+        Result(rows=ROWS[2:], seconds=1.5, machine={"cores": 64}),
+    )
+    write_report(
+        tmp_path / "report",
+        Run(tasks=2, results=results),
+        title="Success",
+        table="| a |\n| --- |\n| 100 |",
+        caption="Three trials a cell.",
+        settings={"command": "evaluate matrix", "seed": 4},
+        began=time.time() - 10,
+        figures={"note.txt": lambda path: path.write_text("a figure")},
+    )
+    return tmp_path / "report"
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "text"),
+    [
+        # Wilson's interval for 15 of 20 is 0.5313 to 0.8881 (see test_metrics).
+        (15, 20, "75 (53-89)"),
+        (200, 200, "100 (98-100)"),
+        (750, 1000, "75.0 (72.2-77.6)"),
+        (9996, 10_000, "99.96 (99.90-99.98)"),
+    ],
+)
+def test_a_share_has_the_digits_that_its_trials_bear(successes, trials, text):
+    assert str(Share(successes=successes, trials=trials)) == text
+
+
+def test_shares_count_outcomes():
+    assert Share.of(word == "reached" for word in ("reached", "fell", "reached")) == Share(
+        successes=2, trials=3
+    )
+
+
+def test_a_markdown_table():
+    table = markdown(["terrain", "ours"], [["steps", 3], ["gaps", "-"]])
+    assert table == "| terrain | ours |\n| --- | --- |\n| steps | 3 |\n| gaps | - |"
+
+
+def test_a_report_keeps_every_trial_and_where_it_came_from(folder):
+    assert json.loads((folder / "rows.json").read_text()) == ROWS
+    assert len((folder / "rows.json").read_text().splitlines()) == len(ROWS) + 2
+    run = json.loads((folder / "run.json").read_text())
+    assert run["settings"]["seed"] == 4 and run["trials"] == 3 and run["tasks"] == 2
+    assert run["machines"] == [{"cores": 2}, {"cores": 64}]
+    assert run["task_seconds"] == 3.5 and 10 <= run["wall_seconds"] < 20
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", run["finished"])
+    assert (folder / "figures" / "note.txt").read_text() == "a figure"
+    assert (folder / "table.md").read_text() == (
+        "# Success\n\n| a |\n| --- |\n| 100 |\n\nThree trials a cell. 3 trials in all.\n"
+    )
+
+
+def test_the_chart_draws_every_share_where_it_lies():
+    groups = {
+        "steps": {"ours": Share(successes=5, trials=10)},
+        "gaps <wide>": {"ours": Share(successes=0, trials=10), "b": Share(successes=9, trials=9)},
+    }
+    chart = ElementTree.fromstring(share_chart(groups, "Success"))
+    dots = [float(mark.attrib["cx"]) for mark in chart.iter() if mark.tag.endswith("circle")]
+    # The axis runs from 200 to 616 px: 0 %, 50 % and 100 % lie at 200, 408 and 616.
+    assert dots == [408.0, 200.0, 616.0]
+    words = [mark.text for mark in chart.iter() if mark.tag.endswith("text")]
+    assert {"Success", "steps", "gaps <wide>", "ours", "100 %"} <= set(words)
+
+
+@pytest.fixture
+def fill():
+    spec = importlib.util.spec_from_file_location("readme_table", SCRIPT)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    return lambda *arguments: script.main([str(argument) for argument in arguments])
+
+
+def test_the_script_writes_the_table_between_its_markers(fill, folder, tmp_path):
+    readme = tmp_path / "README.md"
+    readme.write_text("before\n<!-- table matrix -->\nold\n<!-- end matrix -->\nafter\n")
+    date = json.loads((folder / "run.json").read_text())["finished"][:10]
+    for _ in range(2):  # the second time changes nothing
+        fill(folder, "matrix", readme)
+        assert readme.read_text() == (
+            "before\n<!-- table matrix -->\n| a |\n| --- |\n| 100 |\n\n"
+            "Three trials a cell. 3 trials in all.\n\n"
+            f"*3 trials of `fgtutor evaluate matrix`, {date}.*\n<!-- end matrix -->\nafter\n"
+        )
+
+
+def test_the_script_refuses_what_is_not_finished_or_not_marked(fill, folder, tmp_path):
+    readme = tmp_path / "README.md"
+    readme.write_text("no markers")
+    with pytest.raises(ReportError, match="<!-- table matrix -->"):
+        fill(folder, "matrix", readme)
+    (folder / "table.md").unlink()
+    with pytest.raises(ReportError, match="no finished report"):
+        fill(folder, "matrix", readme)
+    assert readme.read_text() == "no markers"

@@ -1,0 +1,74 @@
+"""Values that cross from a submission: unchanged, plain, and never more than what they are."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fgtutor.errors import ConfigError
+from fgtutor.teach.checks import find
+from fgtutor.teach.checks.question import CRASHED, WRONG, Judge
+from fgtutor.teach.values import decode, difference, encode
+
+Q1, Q3 = "ex10.q1", "ex10.q3"
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        {},
+        {"answers": "passed"},
+        {"answers": [{"array": ["object", [1], "AAAA"]}]},
+        {"answers": [{"array": ["float64", [-1, 10**30], "AAAA"]}]},
+        {"answers": [{"array": ["float64", [1], "AAAAAAAA8D8="]}] * 3},
+        {"answers": [10**400]},
+        {"answers": [[1]]},
+        {"answers": [{"list": [{"list": [[]]}]}]},
+        {"outcome": ["passed"]},
+        {"outcome": "passed"},
+        {"changed": [1]},
+        {"changed": -1},
+    ],
+)
+def test_a_forged_reply_never_passes(reply):
+    for question in (find(Q1), find(Q3)):
+        verdict = Judge(question, question.cases(0)).judge(reply)
+        assert verdict.outcome in (CRASHED, WRONG)
+
+
+def test_a_deep_reply_is_unreadable_not_an_end():
+    deep = "x"
+    for _ in range(5000):
+        deep = {"list": [deep]}
+    assert Judge(find(Q3), None).judge({"answers": [deep]}).outcome == CRASHED
+
+
+@pytest.mark.parametrize(
+    "value",
+    [None, True, 3, 0.5, float("nan"), "text", (1, [2.0, "a"]), np.arange(6).reshape(2, 3)],
+)
+def test_values_cross_unchanged(value):
+    back = decode(json.loads(json.dumps(encode(value))))
+    assert type(back) is type(value)
+    np.testing.assert_equal(back, value)
+
+
+@pytest.mark.parametrize("value", [print, {"a": 1}, np.array([None]), 1j, np.zeros(10**5)])
+def test_values_that_are_not_plain_numbers_do_not_cross(value):
+    with pytest.raises(ConfigError):
+        encode(value)
+
+
+def test_differences_are_shown_where_they_are():
+    expected = np.zeros((4, 3))
+    got = expected.copy()
+    got[3, 0] = 1
+    text = difference(expected, got)
+    assert "1 of 12 values differ" in text and "[3, 0]  0         1" in text
+    assert text.endswith("....\n....\n...x")  # x to the right, y up: cell (3, 0) is lower right
+    assert "two axes swapped" in difference(expected, got.T)
+    assert difference(np.array([1.0, np.nan]), np.array([1, np.nan])) == ""
+    assert "value 2 of the 2" in difference((1.0, 2.0), [1.0, 3.0])
+    assert "Expected 2 values" in difference((1.0, 2.0), np.array(1.0))
+    # Numbers that agree in four digits are shown with more.
+    assert "1.00001" in difference(np.array([1.0]), np.array([1.00001]), rtol=1e-8)

@@ -1,0 +1,152 @@
+"""The widgets in Python: what a browser would send, what it would get, and the PNG without one."""
+
+import io
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from fgtutor.elevation import ElevationMap
+from fgtutor.teach.explorer import Explorer
+from fgtutor.teach.tau_views import TauView
+from fgtutor.tensorization import Assessment
+from fgtutor.terrain import make_terrain
+
+NAMES = ("steps", "gaps", "slopes")
+START, GOAL = (0.25, 0.25), (4.25, 3.25)
+
+
+@pytest.fixture
+def said() -> dict[str, Assessment]:
+    """What three specialists say of the map below."""
+    rng = np.random.default_rng(9)
+    return {
+        name: Assessment(
+            torch.tensor(rng.uniform(0, 1, (9, 7, 8)), dtype=torch.float32),
+            torch.tensor(rng.gamma(1.0, 1.0, (9, 7, 8)), dtype=torch.float32),
+        )
+        for name in NAMES
+    }
+
+
+@pytest.fixture
+def grid() -> ElevationMap:
+    return ElevationMap(np.zeros((9, 7)), resolution=0.5)
+
+
+@pytest.fixture
+def widgets():
+    """The module of the widgets, which needs the lab extra."""
+    pytest.importorskip("ipywidgets", reason="the lab extra is not installed: make test does")
+    pytest.importorskip("anywidget", reason="the lab extra is not installed: make test does")
+    from fgtutor.teach import widgets
+
+    return widgets
+
+
+def say(board, **content) -> None:
+    """What the canvas sends when a person does something."""
+    board.view._handle_custom_msg(content, [])
+
+
+def test_a_drag_redraws_and_the_text_follows(widgets, grid, said):
+    board = widgets.TauExplorer(grid, said, START, GOAL)
+    before = dict(board.view.pictures), board.view.frame
+    board.taus.value = (0.2, 0.7)
+    alone = Explorer(grid, said, START, GOAL, taus=(0.2, 0.7))
+    assert board.view.status == alone.status
+    assert board.view.frame == before[1] + 1
+    assert board.view.pictures["M"] == before[0]["M"]
+    assert board.view.pictures["w gaps"] != before[0]["w gaps"]
+    assert board.view.pictures["P"] == TauView(alone).scene().pictures["P"].tobytes()
+    board.policies["steps"].value = False
+    board.f_min.value, board.switch_cost.value = 0.05, 1.5
+    assert board.explorer.settings == replace(
+        alone.settings, policies=NAMES[1:], f_min=0.05, switch_cost=1.5
+    )
+
+
+def test_clicks_arrows_and_hovering_reach_the_explorer(widgets, grid, said):
+    board = widgets.TauExplorer(grid, said, START, GOAL)
+    say(board, kind="press", cells=[[2, 5]], shift=False)
+    assert board.explorer.settings.goal == grid.centre_of(2, 5)
+    say(board, kind="drag", cells=[[3, 5], [4, 6]], shift=False)
+    assert board.explorer.settings.goal == grid.centre_of(4, 6)
+    say(board, kind="press", cells=[[1, 1]], shift=True)
+    assert board.explorer.settings.start == grid.centre_of(1, 1)
+    board.picks.value = "start"
+    say(board, kind="move", step=[1, -9], shift=False)
+    assert board.explorer.settings.start == grid.centre_of(2, 0)  # it stays on the map
+    say(board, kind="hover", cells=[[4, 4]])
+    assert board.view.reading == board.explorer.read((4, 4))
+    before = board.view.reading
+    board.taus.value = (0.0, 0.3)
+    assert board.view.reading == board.explorer.read((4, 4)) != before
+    say(board, kind="hover", cells=[])
+    assert board.view.reading == ""
+    say(board, kind="hover", cells=[[99, 0]])
+    assert "no cell (99, 0)" in board.view.status
+
+
+def test_a_painter_paints_what_is_dragged_over(widgets, make_specialist):
+    board = widgets.TerrainPainter(ElevationMap(np.zeros((20, 16))), make_specialist())
+    before = dict(board.view.pictures)
+    board.height.value, board.radius.value = 0.3, 0.1
+    say(board, kind="drag", cells=[[5, 5], [8, 5]], shift=False)
+    heights = board.painting.elevation.heights
+    assert heights[5, 6] == heights[8, 4] == np.float32(0.3) and heights[7, 7] == 0
+    assert board.view.pictures["M"] != before["M"] and board.view.overlay["box"] is not None
+    say(board, kind="hover", cells=[[5, 5]])
+    assert "height 0.30 m" in board.view.reading
+    board.heading.value = 0
+    assert board.view.rows[0][1]["title"].endswith("+x")
+    board.clear.click()
+    assert board.view.pictures["M"] == before["M"]
+
+
+def test_a_drive_plays_pauses_and_resets(widgets, make_rolling):
+    board = widgets.DriveA1(make_terrain("flat", robot="toy"), {"steps": make_rolling()})
+    first = board.image.value
+    assert Image.open(io.BytesIO(first)).size == (720, 272)
+    board.speed.value = 0.5
+    board.play.value = 1
+    board.play.value = 2
+    assert len(board.drive.episode.poses) == 5 and board.drive.speed == 0.5
+    assert board.image.value != first and "command (0.50 m/s" in board.status.value
+    board.reset.click()
+    assert len(board.drive.episode.poses) == 1 and not board.play.playing
+
+
+def test_without_anywidget_there_is_a_png(widgets):
+    code = (
+        "import sys; sys.modules['anywidget'] = None\n"
+        "import numpy as np, torch\n"
+        "from fgtutor.elevation import ElevationMap\n"
+        "from fgtutor.tensorization import Assessment\n"
+        "from fgtutor.teach.widgets import TauExplorer\n"
+        "f = torch.zeros(4, 3, 8); f[..., 0] = 1\n"
+        "said = Assessment(f, torch.full((4, 3, 8), 0.5))\n"
+        "M = ElevationMap(np.zeros((4, 3)))\n"
+        "board = TauExplorer(M, {'steps': said}, (.05, .05), (.35, .05))\n"
+        "first = board.view.image.value\n"
+        "board.taus.value = (0.1, 0.9)\n"
+        "print(first[:4] == b'\\x89PNG', board.view.image.value != first)\n"
+        "print(board.view.status.value)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    # w_ood = (0.9 - 0.5) / 0.8 = 0.5, and three steps cost 2 each.
+    assert done.stdout.splitlines() == [
+        "True True",
+        "tau 0.10 to 0.90: cost 6.00, 0.30 m, policy switches: 0 (steps 0.3 m)",
+    ]
+
+
+def test_the_front_end_is_shipped_and_asks_no_network(widgets):
+    for name in ("panels.js", "panels.css"):
+        text = (widgets.STATIC / name).read_text(encoding="utf-8")
+        assert "://" not in text and "import " not in text
+    assert "export default" in widgets.CanvasView._esm
