@@ -35,8 +35,11 @@ browser:
 	else echo "no Chromium and not root: the browser test will be skipped"; fi
 
 # The server asks for its token and listens on the loopback address only.
-lab: $(ALL)
+lab: $(ALL) notebooks/01_elevation_maps.ipynb
 	$(BIN)/jupyter lab --ip=127.0.0.1 notebooks/01_elevation_maps.ipynb
+
+notebooks/%.ipynb: notebooks/src/%.py | $(ALL)
+	$(BIN)/fgtutor notebooks --names $*
 
 notebooks: $(ALL)
 	$(BIN)/fgtutor notebooks

@@ -101,7 +101,7 @@ def _read_ply(path: Path) -> np.ndarray:
 
 
 def _read_pcd(path: Path) -> np.ndarray:
-    from pypcd4 import PointCloud
+    from pypcd4.pypcd4 import PointCloud
 
     cloud = PointCloud.from_path(path)
     missing = {"x", "y", "z"} - set(cloud.fields)
@@ -135,7 +135,7 @@ def _las_points(path: Path) -> np.ndarray:
         records = int.from_bytes(file.read(104)[100:], "little")
     if 54 * records > path.stat().st_size:
         raise CloudError(f"the header promises {records} records, which do not fit into the file")
-    with laspy.open(path, read_evlrs=False) as file:
+    with laspy.open(path, read_evlrs=False) as file:  # pyright: ignore[reportCallIssue]
         points = file.read().xyz
         _check_count(len(points), file.header.point_count)
     return points

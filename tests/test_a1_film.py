@@ -120,9 +120,9 @@ def test_the_camera_turns_with_the_robot_the_short_way(episode, terrain, route):
 def test_a_frame_shows_robot_words_and_map(episode, terrain, route, graphics):
     film = A1Film(episode, terrain, route)
     early, late, last = film.frames([30, 70, 99])
-    assert early.size == (720, 432) and all(side % 16 == 0 for side in early.size)
+    assert early.size == (640, 400) and all(side % 16 == 0 for side in early.size)
     middle = (VIEW[0] // 2 - 60, TITLE + VIEW[1] // 2 - 60, VIEW[0] // 2 + 60, TITLE + VIEW[1] // 2)
-    words, bar = (0, 0, 160, TITLE), (0, 432 - 6, 720, 432)
+    words, bar = (0, 0, 160, TITLE), (0, 400 - 6, 640, 400)
     for frame, colour, other in ((early, "steps", "gaps"), (late, "gaps", "steps")):
         mine, others = POLICY_COLOURS[colour], POLICY_COLOURS[other]
         assert share(frame, mine, middle) > 0.02 and share(frame, others, words) == 0
@@ -130,8 +130,8 @@ def test_a_frame_shows_robot_words_and_map(episode, terrain, route, graphics):
     # 31 of 100 steps have passed at step 30; the second half belongs to the other policy.
     assert share(early, POLICY_COLOURS["steps"], bar) == pytest.approx(0.31, abs=0.01)
     assert share(last, POLICY_COLOURS["gaps"], bar) == pytest.approx(0.5, abs=0.01)
-    inset = (490, TITLE + 10, 710, TITLE + 140)
-    assert np.asarray(early.crop(inset)).std() > np.asarray(early.crop((10, 50, 230, 180))).std()
+    inset = (430, TITLE + 12, 626, TITLE + 135)
+    assert np.asarray(early.crop(inset)).std() > np.asarray(early.crop((10, 50, 206, 173))).std()
 
 
 @pytest.mark.slow
@@ -141,7 +141,7 @@ def test_the_video_lasts_as_long_as_the_walk(episode, terrain, route, graphics, 
     _, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
     assert seconds == pytest.approx(2.0 + videos.HOLD, abs=0.2)
     strip = videos.film_strip(episode, terrain, route, count=3)
-    assert strip.size == (2 * 480 + 6, 2 * 288 + 6)
+    assert strip.size == (2 * 426 + 6, 2 * 266 + 6)
 
 
 def test_without_graphics_nothing_is_left(episode, terrain, route, monkeypatch, tmp_path):

@@ -66,7 +66,7 @@ def test_the_a1_demo_shows_even_a_fall(a1_zoo, tmp_path, capsys, monkeypatch):
         pytest.skip(str(error))
     monkeypatch.setattr(demo, "a1_terrain", lambda: make_terrain("steps", robot="a1", seed=3))
     out = tmp_path / "demo"
-    assert demo.run(demo.DemoConfig(robot="a1", out=out, zoo=a1_zoo)) == 1
+    assert demo.run(demo.DemoConfig(robot="a1", out=out, zoo=a1_zoo, taus="calibrated")) == 1
     names = {"plan.png", "route.json", "drive.mp4", "drive.png"}
     assert {path.name for path in out.iterdir()} == names
     said = capsys.readouterr().out
@@ -80,7 +80,7 @@ def test_without_graphics_the_a1_demo_still_plans(a1_zoo, tmp_path, capsys, monk
     monkeypatch.setattr(demo, "a1_terrain", lambda: make_terrain("steps", robot="a1", seed=3))
     monkeypatch.setenv("MUJOCO_GL", "off")
     out = tmp_path / "demo"
-    assert demo.run(demo.DemoConfig(robot="a1", out=out, zoo=a1_zoo)) == 1
+    assert demo.run(demo.DemoConfig(robot="a1", out=out, zoo=a1_zoo, taus="calibrated")) == 1
     assert {path.name for path in out.iterdir()} == {"plan.png", "route.json"}
     said = capsys.readouterr().out
     assert "no film of it" in said and "apt install" in said and "fell" in said

@@ -7,7 +7,7 @@ Source: paper, Sec. III-A (feasibility is predicted r_v) and Eq. 4.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -76,7 +76,9 @@ def drive(specialist: Specialist, terrain: str, config: CalibrationConfig) -> Dr
         make_terrain(terrain, robot=config.robot, seed=2 * (config.seed * 10_000 + i) + 1)
         for i in range(config.envs)
     ]
-    env = env_class(config.robot)(World([tiles]), config.envs, seed=config.seed + 1)
+    robot = env_class(config.robot)
+    episodes = replace(robot.episodes, history=specialist.history)
+    env = robot(World([tiles]), config.envs, config=episodes, seed=config.seed + 1)
     observations = env.get_observations()
     seen: dict[str, list[Tensor]] = {"tracking": [], "patch": [], "command": []}
     for _ in range(round(config.seconds / env.control_dt)):

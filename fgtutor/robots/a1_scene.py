@@ -99,7 +99,8 @@ def _set_looks(spec: mujoco.MjSpec, width: int, height: int) -> None:
     """Set sky, light and the quality of the picture."""
     spec.add_texture(
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=ZENITH, rgb2=NADIR, width=128, height=128,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=ZENITH, rgb2=NADIR,
+        width=128, height=128,
     )  # fmt: skip
     look = spec.visual
     look.global_.offwidth, look.global_.offheight = width, height

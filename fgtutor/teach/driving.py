@@ -63,7 +63,8 @@ class Drive:
                 "environment; only the toy draws itself"
             )
         robot = env_class(robots[0])
-        config = replace(robot.episodes, train=False, stuck_seconds=math.inf)
+        history = max(specialist.history for specialist in zoo.values())
+        config = replace(robot.episodes, train=False, stuck_seconds=math.inf, history=history)
         self.env = robot(World([[terrain]]), 1, config=config)
         self.terrain, self.zoo, self._render, self._yaw = terrain, dict(zoo), render, yaw
         self.policy, self.turn = next(iter(zoo)), 0.0

@@ -122,9 +122,9 @@ QUESTIONS = (
         name="calibrated_taus",
         points=2,
         title="thresholds from a specialist's own terrain",
-        expects="tau_low is the 90 % and tau_high the 95 % quantile of L_recon on the own terrain.",
+        expects="tau_low is the 90 % and tau_high the 99 % quantile of L_recon on the own terrain.",
         draw=lambda dice: (dice.lognormal(-1, 0.8, dice.integers(60, 200)),),
-        truth=lambda losses: tuple(np.quantile(losses, (0.9, 0.95))),
+        truth=lambda losses: tuple(np.quantile(losses, (0.9, 0.99))),
         mistakes=(
             Mistake(
                 "the wrong tail",
@@ -134,17 +134,17 @@ QUESTIONS = (
             Mistake(
                 "swapped taus",
                 "tau_low comes first and is the smaller one.",
-                lambda losses: tuple(np.quantile(losses, (0.95, 0.9))),
+                lambda losses: tuple(np.quantile(losses, (0.99, 0.9))),
             ),
             Mistake(
                 "shares of the largest loss",
                 "0.9 * max is no quantile: one odd patch would move both thresholds.",
-                lambda losses: (0.9 * losses.max(), 0.95 * losses.max()),
+                lambda losses: (0.9 * losses.max(), 0.99 * losses.max()),
             ),
             Mistake(
                 "percent for shares",
                 "np.percentile counts to 100, np.quantile to 1.",
-                lambda losses: tuple(np.percentile(losses, (0.9, 0.95))),
+                lambda losses: tuple(np.percentile(losses, (0.9, 0.99))),
             ),
             Mistake(
                 "mean and standard deviation",
