@@ -1,5 +1,3 @@
-import base64
-import io
 import json
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -8,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 import tyro
-from PIL import Image
 
 from fgtutor.errors import ConfigError, SpecialistError, TerrainError
 from fgtutor.evaluation import adaptation
@@ -23,9 +20,7 @@ from fgtutor.evaluation.adaptation import (
     table,
     way_of,
 )
-from fgtutor.evaluation.mapchart import DARK, draw_maps
 from fgtutor.feasibility import FeasibilityNet
-from fgtutor.planning import plan
 from fgtutor.robots.a1 import A1_GRID
 from fgtutor.robots.toy import TOY_GRID
 from fgtutor.specialist import ZOO, load_specialist, save_specialist
@@ -160,7 +155,7 @@ def test_a_climber_says_what_it_should(make_climber):
     net = make_climber("late", 0.2).feasibility
     patch = torch.zeros(3, grid.num_points)
     patch[1, 7], patch[2, 7] = 0.15, 0.25
-    f = net.feasibility(patch, torch.zeros(3, 3))
+    f = net.feasibility(patch, torch.zeros(3, 3)).detach()
     assert f[:2] == pytest.approx([0.8, 0.8], abs=0.01) and f[2] < 1e-6
 
 
@@ -206,7 +201,8 @@ def test_the_command_drives_reports_and_resumes(config, capsys, monkeypatch):
             assert row["planned"] - 1.5 < row["length"] < row["planned"]
     lines = (config.out / "table.md").read_text().splitlines()
     assert any(line.startswith("| novice | 10 | none | - | 0 (0-66) | 0.000") for line in lines)
-    assert any(line.startswith("| able | 2,000 | short | 9.") for line in lines)
+    mean = np.mean([row["length"] for row in rows if row["policy"] == "able"])
+    assert any(line.startswith(f"| able | 2,000 | short | {mean:.2f} (") for line in lines)
     assert "straight line of 5 m" in lines[-1] and "4 trials in all" in lines[-1]
     assert json.loads((config.out / "figures" / "routes.json").read_text())["novice"] is None
     ElementTree.parse(config.out / "figures" / "maps.svg")
@@ -277,39 +273,6 @@ def test_the_table_says_where_nothing_was_reached(make_climber):
     assert table([row], zoo).splitlines()[2] == (
         "| late | 1,234,567 | none | - | 0 (0-79) | 0.000 (0.000-0.000) | 0.000 (0.000-0.000) |"
     )
-
-
-def test_the_picture_shows_the_map_the_right_way_up():
-    terrain = make_map("toy", 1)
-    ground = terrain.elevation
-    tensor = torch.zeros(*ground.shape, 8)
-    tensor[:40] = 1.0  # the west is feasible, the east is closed
-    ones = np.ones(tensor.shape)
-    route = plan(ones, 0 * ones, grid=ground, start=(1.0, 1.0), goal=(2.0, 1.0))
-    text = draw_maps(
-        ground,
-        {"early <1>": (tensor, None), "late": (tensor, route)},
-        title="A & B",
-        f_min=0.25,
-        walls=ground.heights > WALL - 1e-3,
-        places={"long": terrain.sections[2]},
-    )
-    svg = ElementTree.fromstring(text)
-    space = "{http://www.w3.org/2000/svg}"
-    words = [element.text for element in svg.iter(f"{space}text")]
-    assert {"A & B", "early <1>: no way", "late: 1.0 m"} <= set(words)
-    assert words.count("6 cm high") == 2  # two risers of 3 cm, in both panels
-    assert len(list(svg.iter(f"{space}polyline"))) == 2  # one route, with a white border
-    images = list(svg.iter(f"{space}image"))
-    assert len(images) == 2
-    data = images[0].get("href").removeprefix("data:image/png;base64,")
-    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))))
-    assert pixels.shape == (*ground.shape[::-1], 3)
-    bottom, top = pixels[-1], pixels[0]
-    assert tuple(bottom[10]) == tuple(top[10]) == (0, 114, 178)
-    assert tuple(bottom[70]) == (217, 217, 217)
-    # At the bottom the way is walled off, at the top lies the last gate.
-    assert tuple(bottom[39]) == DARK and tuple(top[39]) == (0, 114, 178)
 
 
 def test_what_cannot_work_is_refused(tmp_path):
