@@ -12,7 +12,7 @@ from fgtutor import __version__
 from fgtutor.errors import FgtutorError
 
 COMMANDS = {
-    "demo": ("demo", "DemoConfig", "plan over a mixed terrain and drive it with the toy robot"),
+    "demo": ("demo", "DemoConfig", "plan over a mixed terrain and drive it"),
     "train": ("training", "config_of", "train a specialist with its Feasibility-Net"),
     "plan": ("pipeline", "PlanConfig", "plan a route over a map file"),
     "evaluate matrix": (
@@ -34,6 +34,11 @@ COMMANDS = {
         "evaluation.adaptation",
         "AdaptationConfig",
         "plan with early, mid and late checkpoints of one policy",
+    ),
+    "evaluate switching": (
+        "evaluation.switching",
+        "SwitchingConfig",
+        "change the policy on the way, with a robot that does not quite know where it is",
     ),
     "map": ("mapping", "MapConfig", "turn a point cloud into an elevation map"),
     "export": ("export", "ExportConfig", "write a policy as ONNX, with what it observes"),

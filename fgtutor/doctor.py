@@ -18,6 +18,7 @@ from typing import Literal
 
 from fgtutor import __version__
 from fgtutor.errors import FgtutorError
+from fgtutor.robots import GL_BACKENDS
 
 ESSENTIAL = (
     "torch",
@@ -38,8 +39,6 @@ OPTIONAL = ("jupyterlab", "ipywidgets", "anywidget")
 LOW_DISK, LOW_MEMORY = 2.0, 4.0
 """Below these many GB a training's checkpoints, or two trainings side by side, may not fit."""
 
-GL_BACKENDS = {"linux": ("egl", "osmesa"), "darwin": ("cgl",), "win32": ("wgl",)}
-"""Values of MUJOCO_GL that can draw without a window, by sys.platform."""
 _RENDER = (
     "import mujoco\n"
     'scene = \'<mujoco><worldbody><light/><geom size=".1" rgba="1 0 0 1"/></worldbody></mujoco>\'\n'

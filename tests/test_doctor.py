@@ -10,6 +10,7 @@ import pytest
 
 from fgtutor import doctor
 from fgtutor.doctor import DoctorConfig, Finding
+from fgtutor.robots import GL_BACKENDS
 from fgtutor.specialist import save_specialist
 
 
@@ -102,7 +103,7 @@ def test_a_gl_backend_that_does_not_exist_is_named_with_a_reason(monkeypatch):
 
 def test_the_gl_probe_agrees_with_drawing_here(monkeypatch):
     # Whatever this machine can do, the probe says of each backend what a drawing process says.
-    for backend in doctor.GL_BACKENDS.get(sys.platform, ()):
+    for backend in GL_BACKENDS.get(sys.platform, ()):
         drawn = subprocess.run(
             [sys.executable, "-c", doctor._RENDER],
             env=os.environ | {"MUJOCO_GL": backend},

@@ -133,6 +133,6 @@ def test_without_a_library_the_message_says_what_to_do(monkeypatch, tmp_path):
 
 def test_a_system_without_any_library_is_named(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(offscreen, "BACKENDS", {})
+    monkeypatch.setattr(offscreen, "GL_BACKENDS", {})
     with pytest.raises(RenderingError, match="none is known for"):
         Renderer(ball(), *SIZE)

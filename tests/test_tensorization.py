@@ -168,7 +168,7 @@ def test_tensorize_weighs_f_by_familiarity(make_specialist):
 def test_taus_by_name_and_by_number(make_specialist):
     specialist = make_specialist(quantiles={"0.9": 0.2, "0.99": 1.0})
     assert resolve_taus("paper", specialist) == (0.1, 2.0)
-    assert resolve_taus("calibrated", specialist) == (0.2, 1.0)
+    assert resolve_taus("calibrated", specialist) == (0.2, 2.0)
     assert resolve_taus((0.3, 0.4), specialist) == (0.3, 0.4)
 
 

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 ROBOTS = {"toy": ("fgtutor.robots.toy", "ToyEnv"), "a1": ("fgtutor.robots.a1", "A1Env")}
 """Robot name -> module and environment class. A third robot is one file and one entry here."""
 
+GL_BACKENDS = {"linux": ("egl", "osmesa"), "darwin": ("cgl",), "win32": ("wgl",)}
+"""Values of MUJOCO_GL that can draw without a window, in the order of trying, by sys.platform."""
+
 
 def env_class(robot: str) -> "type[LocomotionEnv]":
     """Return a robot's environment class; raises `ConfigError` for an unknown robot."""

@@ -102,7 +102,7 @@ class A1Env(LocomotionEnv):
         self.grid = A1_GRID
         self.control_dt = self.model.timestep * self.settings.substeps
         super().__init__(world, num_envs, config=config, seed=seed, device=device)
-        compiled = _spec(world, self.model).compile()
+        compiled = world_spec(world, self.model).compile()
         self.physics = Physics(compiled, num_envs, threads=threads or torch.get_num_threads())
         self.sensors = sensor_slices()
         ground = np.asarray(world.elevation.filled().heights)
@@ -356,7 +356,7 @@ class A1Env(LocomotionEnv):
         return self.sensed[:, self.sensors[name]].reshape(-1, 4, 3)
 
 
-def _spec(world: World, model: A1Config) -> mujoco.MjSpec:
+def world_spec(world: World, model: A1Config) -> mujoco.MjSpec:
     """Return the model of the world: boxes if its ground is made of blocks, else a height field."""
     tiles = [tile for row in world.tiles for tile in row]
     if all(tile.boxes or _blocky(tile.elevation) for tile in tiles):

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from fgtutor.boxes import Box
 from fgtutor.elevation import ElevationMap
-from fgtutor.robots.a1 import _spec as world_spec
+from fgtutor.robots.a1 import world_spec
 from fgtutor.robots.a1_model import (
     CALF_LENGTH,
     FOOT_RADIUS,

@@ -24,14 +24,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from fgtutor.errors import RenderingError
+from fgtutor.robots import GL_BACKENDS
 
 if TYPE_CHECKING:
     import mujoco
 
 COAT = "coat"
 """The material that a `Shot` gives its colour to."""
-BACKENDS = {"linux": ("egl", "osmesa"), "darwin": ("cgl",), "win32": ("wgl",)}
-"""Values of MUJOCO_GL that can draw without a window, in the order of trying, by sys.platform."""
 CURE = (
     "on Debian or Ubuntu, apt install libegl1 or libosmesa6; if a library was chosen by "
     "MUJOCO_GL, unset it; `fgtutor doctor` tells more"
@@ -84,7 +83,7 @@ class Renderer:
         mujoco.mj_saveModel(model, str(self._path("model.mjb")))
         wanted = os.environ.get("MUJOCO_GL")
         refusals = []
-        for self.backend in (wanted,) if wanted else BACKENDS.get(sys.platform, ()):
+        for self.backend in (wanted,) if wanted else GL_BACKENDS.get(sys.platform, ()):
             self._process = self._start()
             with self._deadline() as late:
                 answer = self._pipe("stdout").read(len(READY))

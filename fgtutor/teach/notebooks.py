@@ -95,7 +95,10 @@ def build(source: Path, *, timeout: int = 900) -> NotebookNode:
     from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
 
     notebook = read_source(source)
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as settings,
+    ):
         client = NotebookClient(
             notebook,
             kernel_name="python3",
@@ -107,7 +110,7 @@ def build(source: Path, *, timeout: int = 900) -> NotebookNode:
         )
         try:
             # The reader's own IPython start-up files are no part of the course.
-            client.execute(env=os.environ | {FAST: "1", "IPYTHONDIR": folder})
+            client.execute(env=os.environ | {FAST: "1", "IPYTHONDIR": settings})
         except (CellExecutionError, CellTimeoutError, DeadKernelError) as error:
             raise NotebookError(f"{source.name} does not run: {error}") from error
     for cell in notebook.cells:

@@ -197,7 +197,8 @@ draw_losses(losses, taus)
 # *What to see in the lower half:* left of $\tau_\text{low}$ the net is trusted fully, right of
 # $\tau_\text{high}$ not at all. The paper's taus are one pair for all. The *calibrated* ones come
 # from the specialist's own training: nine tenths of its terrain keep full weight, and what is
-# rebuilt worse than all but a hundredth of it counts as never seen.
+# rebuilt twice as badly as all but a hundredth of it counts as never seen. (Why twice? A route has
+# a hundred places and needs them all.)
 
 # %%
 from fgtutor.feasibility import ood_weight

@@ -122,29 +122,34 @@ QUESTIONS = (
         name="calibrated_taus",
         points=2,
         title="thresholds from a specialist's own terrain",
-        expects="tau_low is the 90 % and tau_high the 99 % quantile of L_recon on the own terrain.",
+        expects="tau_low is the 90 % and tau_high twice the 99 % quantile of the own L_recon.",
         draw=lambda dice: (dice.lognormal(-1, 0.8, dice.integers(60, 200)),),
-        truth=lambda losses: tuple(np.quantile(losses, (0.9, 0.99))),
+        truth=lambda losses: tuple(np.quantile(losses, (0.9, 0.99)) * (1, 2)),
         mistakes=(
             Mistake(
                 "the wrong tail",
                 "q10 and q5 are losses of the MOST familiar patches.",
-                lambda losses: tuple(np.quantile(losses, (0.1, 0.05))),
+                lambda losses: tuple(np.quantile(losses, (0.1, 0.05)) * (1, 2)),
             ),
             Mistake(
                 "swapped taus",
                 "tau_low comes first and is the smaller one.",
-                lambda losses: tuple(np.quantile(losses, (0.99, 0.9))),
+                lambda losses: tuple(np.quantile(losses, (0.99, 0.9)) * (2, 1)),
+            ),
+            Mistake(
+                "a forgotten factor",
+                "tau_high is TWICE the 99 % quantile: no hundredth of the own terrain closes.",
+                lambda losses: tuple(np.quantile(losses, (0.9, 0.99))),
             ),
             Mistake(
                 "shares of the largest loss",
                 "0.9 * max is no quantile: one odd patch would move both thresholds.",
-                lambda losses: (0.9 * losses.max(), 0.99 * losses.max()),
+                lambda losses: (0.9 * losses.max(), 2 * 0.99 * losses.max()),
             ),
             Mistake(
                 "percent for shares",
                 "np.percentile counts to 100, np.quantile to 1.",
-                lambda losses: tuple(np.percentile(losses, (0.9, 0.99))),
+                lambda losses: tuple(np.percentile(losses, (0.9, 0.99)) * (1, 2)),
             ),
             Mistake(
                 "mean and standard deviation",
