@@ -20,10 +20,10 @@ demo: $(BASE)
 	$(BIN)/fgtutor demo
 
 test: $(ALL) browser
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
 test-fast: $(ALL)
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal -m "not slow"
 
 # One test moves a slider in a real browser. Installing one needs root; without, that test is skipped.
 browser:

@@ -40,6 +40,11 @@ COMMANDS = {
         "SwitchingConfig",
         "change the policy on the way, with a robot that does not quite know where it is",
     ),
+    "evaluate newcomer": (
+        "evaluation.newcomer",
+        "NewcomerConfig",
+        "say what one more specialist adds, and that it changes no other",
+    ),
     "map": ("mapping", "MapConfig", "turn a point cloud into an elevation map"),
     "export": ("export", "ExportConfig", "write a policy as ONNX, with what it observes"),
     "notebooks": ("teach.notebooks", "NotebooksConfig", "execute the course's notebooks"),

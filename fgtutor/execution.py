@@ -1,7 +1,7 @@
 """Driving a planned route in simulation: follow it, and switch to the policy that each edge names.
 
 Reads routes, terrains and specialists; gives an `Episode` each. Trials run side by side: one
-environment holds all terrains as tiles of one world.
+environment holds each terrain as one tile of its world, and trials of one terrain share that tile.
 Source: paper, Sec. III-C (policy map P) and Sec. IV-B (what counts as a failure); the follower is
 pure pursuit (Coulter, 1992).
 """
@@ -106,6 +106,7 @@ def execute_batch(
 ) -> list[Episode]:
     """Drive route i on terrain i with the policies of `zoo`, all at once; return the episodes.
 
+    Trials on one `Terrain` stand on one tile, where they cannot meet: robots do not collide.
     A route's policy indices count in the order of `zoo`. Raises `ConfigError` if the lists differ
     in length, the zoo is empty or mixes robots, or a route names a policy that `zoo` lacks.
     """
@@ -134,8 +135,10 @@ def execute_batch(
         stuck_seconds=math.inf,
         history=max(specialist.history for specialist in specialists),
     )
-    env = robot(World([list(terrains)]), len(routes), config=episodes)
-    return _Drive(env, routes, specialists, seeds, settings).run(record_body, progress)
+    tiles = {terrain: index for index, terrain in enumerate(dict.fromkeys(terrains))}
+    env = robot(World([list(tiles)]), len(routes), config=episodes)
+    where = torch.tensor([tiles[terrain] for terrain in terrains])
+    return _Drive(env, where, routes, specialists, seeds, settings).run(record_body, progress)
 
 
 class _Drive:
@@ -144,6 +147,7 @@ class _Drive:
     def __init__(
         self,
         env: LocomotionEnv,
+        tiles: Int[Tensor, "trials"],
         routes: Sequence[Route],
         specialists: Sequence[Specialist],
         seeds: Sequence[int],
@@ -152,7 +156,7 @@ class _Drive:
         self.env, self.specialists, self.config = env, specialists, config
         self.tracks = [_Track(route) for route in routes]
         self.speed = min(specialist.command[0] for specialist in specialists)
-        self.corners = env.offsets[0].cpu().numpy().astype(np.float64)
+        self.corners = env.offsets[0, tiles].cpu().numpy().astype(np.float64)
         self.dice = [np.random.default_rng(seed) for seed in seeds]
         self.limits = np.array(
             [
@@ -165,7 +169,7 @@ class _Drive:
         self.active = np.array([track.policy for track in self.tracks])
         self.waiting = np.zeros(n, dtype=int)
         env.row = torch.zeros(n, dtype=torch.long)
-        env.column = torch.arange(n)
+        env.column = tiles
         starts = [
             (
                 *(track.points[0] + corner + config.start_noise * dice.standard_normal(2)),

@@ -41,7 +41,7 @@ class TerrainScale:
     """Share of flights and hills that differ between a left and a right lane."""
     bank_share: float = 0.5
     """Share of hills whose plateau is banked sideways."""
-    gap_width: tuple[float, float] = (0.05, 0.15)
+    gap_width: tuple[float, float] = (0.1, 0.15)
     """Width of a gap, m."""
     platform: tuple[float, float] = (0.8, 1.6)
     """Shortest and longest platform between two gaps, m."""

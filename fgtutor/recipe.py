@@ -45,7 +45,7 @@ class TrainConfig:
     iterations: int = 200
     """PPO iterations in all."""
     num_envs: int = 128
-    """Robots simulated side by side."""
+    """Robots simulated side by side (by each process)."""
     steps: int = 40
     """Control steps per robot and iteration."""
     seed: int = 1
@@ -58,6 +58,8 @@ class TrainConfig:
     """Difficulty rows of the training world."""
     columns: int = 12
     """Terrain variants per row."""
+    start_row: int = 0
+    """Difficulty row that robots begin on: more for a policy that goes on where another stopped."""
     planning_speed: float = 0.85
     """Forward speed of the command that planning pairs with every patch, m/s."""
     hidden: tuple[int, ...] = (128, 64)
@@ -89,13 +91,13 @@ class TrainConfig:
     threads: int = 1
     """Torch threads; two trainings side by side with one thread each beat one with two."""
     device: str = "cpu"
-    """Where the networks live: cpu, or cuda:0."""
+    """Where the networks live: cpu, cuda:0, or cuda under torchrun."""
 
     def __post_init__(self) -> None:
         for name in ("iterations", "num_envs", "steps", "save_every", "rows", "columns", "threads"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("label_seconds", "hours", "critic_warmup"):
+        for name in ("label_seconds", "hours", "critic_warmup", "start_row"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must be 0 or more, got {getattr(self, name)}")
 
@@ -178,7 +180,9 @@ def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
         training_world(config, iteration),
         config.num_envs,
         config=dataclasses.replace(
-            make.episodes, history=HISTORY if config.actor == "dreamwaq" else 0
+            make.episodes,
+            history=HISTORY if config.actor == "dreamwaq" else 0,
+            start_row=config.start_row,
         ),
         seed=config.seed,
         device=config.device,

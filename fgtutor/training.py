@@ -2,7 +2,8 @@
 
 Reads a robot, a terrain name and a `TrainConfig`; gives a `Specialist` folder and, on the way,
 tensorboard curves and checkpoints to resume from. No data is collected for the Feasibility-Net
-alone: labels come from the tracking rewards in rsl_rl's rollout storage.
+alone: labels come from the tracking rewards in rsl_rl's rollout storage. Under torchrun, several
+processes train one specialist together (see `distributed`).
 Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
 """
 
@@ -13,6 +14,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,9 +23,10 @@ from typing import Any
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 import torch
-from rsl_rl.runners import OnPolicyRunner
 from tqdm import tqdm
 
+from fgtutor import distributed
+from fgtutor.distributed import leads
 from fgtutor.errors import CheckpointError, ConfigError
 from fgtutor.ppo import QUANTILES, FeasibilityPPO
 from fgtutor.recipe import (
@@ -35,6 +38,7 @@ from fgtutor.recipe import (
     runner_config,
     training_world,
 )
+from fgtutor.robots.base import LocomotionEnv
 from fgtutor.specialist import Specialist, load_specialist, save_specialist
 from fgtutor.storage import atomic_write, make_folder
 
@@ -47,10 +51,10 @@ class Trainer:
     def __init__(self, config: TrainConfig) -> None:
         """Build the world, the robots and the learner; nothing is simulated yet."""
         self.config = config
-        torch.set_num_threads(config.threads)
-        torch.manual_seed(config.seed)
-        self.env = make_training_env(config)
         self.iteration = 0
+        torch.set_num_threads(config.threads)
+        torch.manual_seed(distributed.own_seed(config.seed))
+        self.env = self._make_env()
         half_window = (round(config.label_seconds / self.env.control_dt) + 1) // 2
         if config.steps <= half_window:
             raise ConfigError(
@@ -58,8 +62,11 @@ class Trainer:
                 f"label: set steps to {half_window + 1} or more, or label_seconds lower"
             )
         with contextlib.redirect_stdout(io.StringIO()):
-            self.runner = OnPolicyRunner(
-                self.env, runner_config(config, self.env), log_dir=None, device=config.device
+            self.runner = distributed.Runner(
+                self.env,
+                runner_config(config, self.env),
+                log_dir=None,
+                device=distributed.own_device(config.device),
             )
         self.algorithm: FeasibilityPPO = self.runner.alg  # type: ignore[assignment]
         self.samples_before = 0
@@ -77,7 +84,12 @@ class Trainer:
     def samples(self) -> int:
         """Control steps learned from so far, those of the policy it started from included."""
         own = self.iteration * self.config.num_envs * self.config.steps
-        return self.samples_before + own
+        return self.samples_before + own * distributed.processes()
+
+    def _make_env(self) -> LocomotionEnv:
+        """Build this process's robots, on the CPU as their physics, on ground of its own."""
+        seed = distributed.own_seed(self.config.seed)
+        return make_training_env(replace(self.config, seed=seed, device="cpu"), self.iteration)
 
     def _start_from(self, specialist: Specialist) -> None:
         """Take over a trained policy, all but its action noise; the Feasibility-Net stays new."""
@@ -109,9 +121,13 @@ class Trainer:
             "iteration": self.iteration,
             "samples": self.samples,
             "seconds": self.seconds,
-            "row": self.env.row.float().mean().item(),
-            "std": self.algorithm.get_policy().output_std.mean().item(),
-            **self.algorithm.metrics,
+            **distributed.mean(
+                {
+                    "row": self.env.row.float().mean().item(),
+                    "std": self.algorithm.get_policy().output_std.mean().item(),
+                    **self.algorithm.metrics,
+                }
+            ),
         }
         self.history.append(row)
         return row
@@ -123,15 +139,25 @@ class Trainer:
         the physics is rebuilt, in the run that goes on as in the run that resumes: both continue
         from the same state, bit for bit. The new world holds other terrain of the same kind, so
         that a policy sees many variants of it and a simulation at a time only few.
+
+        Of several processes the first one writes, for all of them.
         """
+        mine = {"env": self.env.state_dict(), "torch_random": torch.get_rng_state()}
+        first, *others = distributed.gather(mine)
+        if leads():
+            self._write(first | {"others": others})
+        self._renew(mine["env"])
+        self.algorithm.memory.clear()
+
+    def _write(self, processes: dict[str, Any]) -> None:
+        """Write checkpoint and snapshot, with what is each process's own."""
         state = {
             "config": json.dumps(comparable(self.config)),
             "iteration": self.iteration,
             "seconds": self.seconds,
             "history": json.dumps(self.history),
             "algorithm": self.algorithm.save(),
-            "env": self.env.state_dict(),
-            "torch_random": torch.get_rng_state(),
+            **processes,
         }
         # Through memory: torch's own writer reports a full disk as something else than an OSError.
         buffer = io.BytesIO()
@@ -139,12 +165,10 @@ class Trainer:
         with atomic_write(self.checkpoint) as temporary:
             temporary.write_bytes(buffer.getvalue())
         save_specialist(self.specialist(), self.config.folder / "snapshots" / f"{self.iteration}")
-        self._renew(state["env"])
-        self.algorithm.memory.clear()
 
     def _renew(self, state: dict[str, torch.Tensor]) -> None:
         """Move to the world that belongs to this iteration, with the curriculum of `state`."""
-        self.env = self.runner.env = make_training_env(self.config, self.iteration)
+        self.env = self.runner.env = self._make_env()
         self.env.load_state_dict(state)
         self.env.reset_all()
 
@@ -157,7 +181,7 @@ class Trainer:
         if not path.exists():
             raise CheckpointError(f"no checkpoint at {path}: start without --resume")
         try:
-            state = torch.load(path, weights_only=True, map_location=self.config.device)
+            state = torch.load(path, weights_only=True, map_location="cpu")
             mine = comparable(self.config)
             # A setting younger than the checkpoint had what is now its default.
             stored = comparable(type(self.config)()) | json.loads(state["config"])
@@ -172,13 +196,20 @@ class Trainer:
             raise CheckpointError(
                 f"{path} belongs to another run: {what}. Use the same settings, or another --out"
             )
+        everyone = [state, *state.get("others", ())]
+        if len(everyone) != distributed.processes():
+            raise CheckpointError(
+                f"{path} was written by {len(everyone)} processes, these are "
+                f"{distributed.processes()}: go on with as many, or use another --out"
+            )
+        own = everyone[distributed.rank()]
         self.algorithm.load(state["algorithm"])
         warm = self.config.start_from and state["iteration"] < self.config.critic_warmup
         self.algorithm.get_policy().requires_grad_(not warm)
         self.iteration, self.seconds = state["iteration"], state["seconds"]
-        self._renew(state["env"])
+        self._renew(own["env"])
         self.history = json.loads(state["history"])
-        torch.set_rng_state(state["torch_random"].cpu())
+        torch.set_rng_state(own["torch_random"])
 
     def specialist(self) -> Specialist:
         """Return what has been learned so far as a `Specialist`."""
@@ -200,6 +231,7 @@ class Trainer:
                 "terrain": config.terrain,
                 "samples": self.samples,
                 "seed": config.seed,
+                "processes": distributed.processes(),
                 "seconds": round(self.seconds, 1),
                 "config": comparable(config),
                 "versions": {p: version(p) for p in ("torch", "rsl-rl-lib", "pymunk", "mujoco")},
@@ -217,23 +249,41 @@ def train(
     learned; `config.resume` continues. `on_iteration` gets each iteration's numbers (the notebooks
     draw them).
     """
-    trainer = Trainer(config)
-    if config.resume:
-        trainer.resume()
+    with distributed.leave_at_end():
+        trainer = Trainer(config)
+        if config.resume:
+            trainer.resume()
+        _iterate(trainer, on_iteration)
+        specialist = trainer.specialist()
+        if leads():
+            save_specialist(specialist, config.folder / "specialist")
+        return specialist
+
+
+def _iterate(
+    trainer: Trainer, on_iteration: Callable[[dict[str, float]], None] | None = None
+) -> None:
+    """Train to the end, to the time limit or to a Ctrl-C, and leave a checkpoint."""
     from torch.utils.tensorboard import SummaryWriter
 
-    make_folder(config.folder)
-    began = time.monotonic()
+    config, began = trainer.config, time.monotonic()
+    if leads():
+        make_folder(config.folder)
     with (
-        SummaryWriter(str(config.folder / "tensorboard")) as writer,
-        tqdm(total=config.iterations, initial=trainer.iteration, unit="it") as bar,
+        SummaryWriter(str(config.folder / "tensorboard"))
+        if leads()
+        else contextlib.nullcontext() as writer,
+        tqdm(
+            total=config.iterations, initial=trainer.iteration, unit="it", disable=not leads()
+        ) as bar,
         stop_on_interrupt() as stopped,
     ):
         bar.set_description(f"{config.robot} {config.terrain}")
         while trainer.iteration < config.iterations:
             row = trainer.iterate()
-            for name, value in row.items():
-                writer.add_scalar(name, value, trainer.iteration)
+            if writer:
+                for name, value in row.items():
+                    writer.add_scalar(name, value, trainer.iteration)
             bar.update()
             bar.set_postfix(
                 r_v=f"{row['r_v']:.2f}", row=f"{row['row']:.1f}", std=f"{row['std']:.2f}"
@@ -242,13 +292,12 @@ def train(
                 on_iteration(row)
             if trainer.iteration % config.save_every == 0:
                 trainer.save()
-            if stopped() or (config.hours and time.monotonic() - began > 3600 * config.hours):
+            late = config.hours > 0 and time.monotonic() - began > 3600 * config.hours
+            # One process must not stop while the others wait for its gradients.
+            if any(distributed.gather(stopped() or late)):
                 break
         if trainer.iteration % config.save_every:
             trainer.save()
-    specialist = trainer.specialist()
-    save_specialist(specialist, config.folder / "specialist")
-    return specialist
 
 
 @contextlib.contextmanager
@@ -280,5 +329,7 @@ def run(config: TrainConfig) -> int:
     """Train from the command line and say where the result lies."""
     specialist = train(config)
     samples = specialist.provenance["samples"]
-    print(f"{config.robot} {config.terrain}: {samples:,} samples -> {config.folder / 'specialist'}")
+    if leads():
+        done = f"{config.robot} {config.terrain}: {samples:,} samples"
+        print(f"{done} -> {config.folder / 'specialist'}")
     return 0

@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from fgtutor import execution
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.execution import FollowConfig, execute, execute_batch
@@ -69,6 +72,23 @@ def test_a_batch_gives_what_single_trials_give(make_rolling):
         assert alone.reason == together[index].reason
         # Lanes lie at other heights in pymunk's space: equal up to what a float holds there.
         assert alone.poses[:20] == pytest.approx(together[index].poses[:20], abs=1e-3)
+
+
+def test_trials_on_one_terrain_share_a_tile_and_do_not_meet(make_rolling, monkeypatch):
+    worlds, make = [], execution.World
+    monkeypatch.setattr(execution, "World", lambda tiles: worlds.append(tiles) or make(tiles))
+    one, other = (make_terrain("rubble", difficulty=0.3, seed=seed) for seed in (1, 3))
+    routes = [straight(t.elevation, t.start, (6.0, t.start[1])) for t in (one, other, one, one)]
+    zoo, seeds = {"roll": make_rolling()}, (7, 8, 7, 9)
+    shared = execute_batch(routes, [one, other, one, one], zoo, seeds=seeds)
+    apart = execute_batch(routes, [one, other, replace(one), replace(one)], zoo, seeds=seeds)
+    assert [len(row) for (row,) in worlds] == [2, 4]
+    for here, there in zip(shared, apart, strict=True):
+        assert here.reason == there.reason
+        assert here.poses[:20] == pytest.approx(there.poses[:20], abs=1e-3)
+    # The same seed drives the same way, though another robot stands in the same place.
+    assert shared[0].poses[:20] == pytest.approx(shared[2].poses[:20], abs=1e-6)
+    assert not np.array_equal(shared[0].poses[0], shared[3].poses[0])
 
 
 def test_the_policy_switches_where_the_route_says_and_holds_on_a_flicker(make_rolling):

@@ -151,7 +151,7 @@ def test_the_command_drives_reports_and_resumes(config, capsys, monkeypatch):
     for row in rows:
         assert row["ground"] % 2 == 1 and row["seed"] == row["ground"]
         assert (row["course"], row["outcome"], row["switches"]) == ("flat-flat", "reached", 0)
-        assert math.dist(row["end"], goal) <= 0.36
+        assert math.dist(row["end"], goal) <= 0.40  # goal radius, noise
     lengths = {
         (row["policy"], row["noise"], row["drift"], row["seed"]): row["length"] for row in rows
     }

@@ -309,3 +309,10 @@ def test_the_generalist_trains_on_every_specialty():
     world = training_world(TrainConfig(terrain="general", rows=1, columns=8))
     assert [tile.name for tile in world.tiles[0]] == ["steps", "gaps", "slopes", "rubble"] * 2
     assert all(tile.seed % 2 == 0 for tile in world.tiles[0])
+
+
+def test_robots_begin_on_the_row_that_is_asked_for(tmp_path):
+    trainer = Trainer(TrainConfig(**TINY | {"out": tmp_path / "run", "start_row": 1}))
+    assert trainer.env.row.unique().tolist() == [1]
+    with pytest.raises(ConfigError, match="start_row must be 0 or more"):
+        TrainConfig(start_row=-1)

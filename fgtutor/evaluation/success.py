@@ -1,4 +1,4 @@
-"""Success rates over drawn grounds: what the matrix and the ablation have in common.
+"""Success rates over drawn grounds: what matrix, ablation and newcomer have in common.
 
 Reads a `TrialsConfig`, terrains and the names of planners; gives a row a pair, and a report folder.
 Trial k of a terrain is the same ground, start and goal for all planners.
@@ -130,9 +130,15 @@ def with_random_ends(terrain: Terrain, seed: int) -> Terrain:
 
 
 def make_tasks(
-    config: TrialsConfig, terrains: Sequence[str], policies: Sequence[str]
+    config: TrialsConfig,
+    terrains: Sequence[str],
+    policies: Sequence[str],
+    work: Callable[..., list[Row]] | None = None,
 ) -> list[Task]:
-    """Cut an evaluation into tasks; the cut depends on the trials only, never on the workers."""
+    """Cut an evaluation into tasks; the cut depends on the trials only, never on the workers.
+
+    `work` does what `run_task` does by default, with the same arguments.
+    """
     for name in terrains:  # an unknown name fails here, not in a worker an hour later
         make_terrain(name, robot=config.robot, difficulty=config.difficulty)
     # A ground that is driven 250 times is work enough for a task.
@@ -140,7 +146,7 @@ def make_tasks(
     return [
         Task(
             name=f"{terrain}-{first:05d}",
-            function=run_task,
+            function=work or run_task,
             arguments=(config, terrain, tuple(policies), range(config.grounds)[first:][:size]),
         )
         for terrain in terrains
@@ -212,12 +218,17 @@ def run_and_report(
     terrains: Sequence[str],
     policies: Sequence[str],
     table: Callable[[Sequence[Row]], str],
+    work: Callable[..., list[Row]] | None = None,
+    remark: Callable[[Sequence[Row]], str] | None = None,
 ) -> int:
-    """Estimate, evaluate, print the table (made of all trials) and write what was asked for."""
+    """Estimate, evaluate, print the table (made of all trials) and write what was asked for.
+
+    `work` is as in `make_tasks`; a `remark` on all trials ends the caption.
+    """
     began = time.time()
     if config.json:
         check_writable(config.json)
-    tasks = make_tasks(config, terrains, policies)
+    tasks = make_tasks(config, terrains, policies, work)
     settings = _settings(config, command, terrains, policies)
     left = len(tasks) - len(finished(tasks, settings, config))
     if left:
@@ -241,6 +252,8 @@ def run_and_report(
         f"protocol {config.protocol}, tau {config.taus}, switch cost {config.switch_cost:g}, "
         f"seed {config.seed}."
     )
+    if remark:
+        caption = f"{caption} {remark(run.rows)}"
     print(f"{text}\n\n{caption}")
     if config.json:
         write_json(config.json, rows)

@@ -43,9 +43,9 @@ STEEPNESS = 25.0
 """How far down the camera looks, degrees."""
 HARDLY = 1e-9
 """As good as no lower limit on feasibility: f is a sigmoid, and never quite 0."""
-DOTS = 30_000
+DOTS = 5_000
 """Points of a cloud that are drawn at most: more would only cover each other."""
-PAGE = 960
+PAGE = 840
 """Widest film strip, pixels: a notebook is no wider, and must stay small."""
 
 
@@ -278,7 +278,7 @@ def draw_cloud(
     figure = Picture(7.2, 4.8)
     above, side = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.2))
     reach = max(0.1, float(np.quantile(np.abs(z), 0.999)))
-    style = {"s": 0.6, "cmap": GROUND, "vmin": -reach, "vmax": reach, "linewidths": 0}
+    style = {"s": 2.0, "cmap": GROUND, "vmin": -reach, "vmax": reach, "linewidths": 0}
     dots = above.scatter(x, y, c=z, **style)
     side.scatter(x, z, c=z, **style)
     if sensors is not None:

@@ -245,7 +245,8 @@ def draw_graph(
         axes.plot(*np.stack((a, b)).T, color=INK, linewidth=2.5, alpha=0.8)
         weight = graph.edges[tail, head]["weight"]
         box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": INK}
-        axes.text(*((a + b) / 2), f"{weight:.2f}", ha="center", va="center", fontsize=8, bbox=box)
+        x, y = (a + b) / 2
+        axes.text(x, y, f"{weight:.2f}", ha="center", va="center", fontsize=8, bbox=box)
     _legend(figure, dict(zip(names, colours, strict=True)))
     _say(axes, "The graph: a node a cell, an arrow a step", "The fuller an arrow, the cheaper")
     return figure  # pyright: ignore[reportReturnType]

@@ -26,6 +26,9 @@ from fgtutor.teach.figures import draw_elevation
 
 zoo = load_zoo("toy")
 names = tuple(zoo)
+names
+
+# %%
 M = ElevationMap.load(MAP)
 draw_elevation(M)
 

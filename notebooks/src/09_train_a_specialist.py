@@ -26,6 +26,8 @@ from fgtutor.teach.figures import training_curve
 
 steps = load_zoo("a1")["steps"]
 record = steps.provenance
+
+# %%
 print(f"{record['samples']:,} samples, the walker's that it started from included")
 print(f"{record['seconds'] / 60:.0f} minutes of its own, seed {record['seed']}")
 training_curve(record["curve"])
@@ -44,18 +46,23 @@ training_curve(record["curve"])
 # %%
 from pathlib import Path
 
-from fgtutor.recipe import A1TrainConfig, training_world
+from fgtutor.recipe import A1TrainConfig
 from fgtutor.specialist import ZOO
-from fgtutor.teach.figures import draw_elevation
 from fgtutor.teach.notebooks import budget
 
+walker = ZOO / "a1" / "_walker"
 robots = budget(fast=48, full=256, unit="robots")
-iterations = budget(fast=6, full=60, unit="iterations of 40 steps", each=5.0)
+iterations = budget(fast=4, full=60, unit="iterations of 40 steps", each=5.0)
 config = A1TrainConfig(
     terrain="steps", rows=5, columns=2, num_envs=robots, iterations=iterations,
-    start_from=ZOO / "a1" / "_walker", critic_warmup=2, save_every=20,
+    start_from=walker, critic_warmup=2, save_every=20,
     out=Path("runs") / f"09-steps-{robots}-{iterations}",
 )  # fmt: skip
+
+# %%
+from fgtutor.recipe import training_world
+from fgtutor.teach.figures import draw_elevation
+
 draw_elevation(training_world(config).elevation)
 
 # %% [markdown]
@@ -65,12 +72,12 @@ draw_elevation(training_world(config).elevation)
 # has to write a timetable.
 
 # %%
-from fgtutor.robots.a1 import A1_EPISODES as rules
+from fgtutor.robots.a1 import A1_EPISODES
 
-print(f"up a row:   mean r_v above {rules.promote_above}, and no fall")
-print(f"down a row: mean r_v below {rules.demote_below}, or a fall in the tile's first half")
-print(f"a new episode after {rules.episode_seconds:.0f} s, a fall,")
-print(f"or {rules.stuck_seconds} s without moving {100 * rules.stuck_progress:.0f} cm")
+print(f"up a row:   mean r_v above {A1_EPISODES.promote_above}, and no fall")
+print(f"down a row: mean r_v below {A1_EPISODES.demote_below}, or a fall in the tile's first half")
+print(f"a new episode after {A1_EPISODES.episode_seconds:.0f} s, a fall,")
+print(f"or {A1_EPISODES.stuck_seconds} s without moving {100 * A1_EPISODES.stuck_progress:.0f} cm")
 
 # %% [markdown]
 # The last line matters: a robot that has learned to stop before each step never falls. *Waiting
@@ -107,6 +114,7 @@ def answer_for(lam):
     return [fade[: T - t] @ surprise[t:] for t in range(T)]
 
 
+# %%
 draw_curves(
     np.arange(T),
     {"surprise alone (λ = 0)": answer_for(0.0), f"advantage (λ = {lam})": answer_for(lam)},
@@ -142,11 +150,12 @@ def impatient(row):
         signal.raise_signal(signal.SIGINT)  # "stop", as the button says it
 
 
+# %%
 started = (config.out / "checkpoint.pt").exists()
 half = train(replace(config, resume=started), on_iteration=impatient)
+live.draw(half.provenance["curve"])
 
 # %%
-stopped_at = len(half.provenance["curve"])
 print(f"stopped: {half.provenance['samples']:,} samples so far, the walker's included")
 
 # %% [markdown]
@@ -155,8 +164,9 @@ print(f"stopped: {half.provenance['samples']:,} samples so far, the walker's inc
 # says so).
 
 # %%
-mine = train(replace(config, resume=True), on_iteration=live)
-live.draw(mine.provenance["curve"])
+again = LiveCurve()
+mine = train(replace(config, resume=True), on_iteration=again)
+again.draw(mine.provenance["curve"])
 
 # %% [markdown]
 # *What to see:* $r_v$ is high from the first iteration on. That is the walker's doing, not yours.
@@ -167,12 +177,14 @@ live.draw(mine.provenance["curve"])
 # that a log shows.
 
 # %%
-from tqdm import tqdm
-
 from fgtutor.training import Trainer
 
-crank = min(iterations, budget(fast=6, full=25, unit="iterations", each=5.0))
+crank = budget(fast=4, full=25, unit="iterations", each=5.0)
 scratch = Trainer(replace(config, start_from=None, out=Path("runs") / "09-from-nothing"))
+
+# %%
+from tqdm import tqdm
+
 rows, rates = [], []
 for _ in tqdm(range(crank)):
     rows.append(scratch.iterate())
@@ -216,13 +228,16 @@ draw_curves(
 
 # %%
 from fgtutor import load_specialist, make_terrain
+
+count = budget(fast=4, full=20, unit="grounds for each of three drivers", each=2.0)
+exam = [make_terrain("steps", robot="a1", difficulty=0.65, seed=2 * i + 1) for i in range(count)]
+drivers = {"walker": load_specialist(walker), "mine": mine, "steps": steps}
+
+# %%
 from fgtutor.execution import FollowConfig
 from fgtutor.teach.a1_lessons import drive_together
 from fgtutor.teach.lessons import straight_route
 
-count = budget(fast=4, full=20, unit="grounds for each of three drivers", each=2.0)
-exam = [make_terrain("steps", robot="a1", difficulty=0.65, seed=2 * i + 1) for i in range(count)]
-drivers = {"walker": load_specialist(ZOO / "a1" / "_walker"), "mine": mine, "steps": steps}
 jobs = [(straight_route(ground, name), ground, i) for name in drivers
         for i, ground in enumerate(exam)]  # fmt: skip
 walks = drive_together(jobs, drivers, config=FollowConfig(patience=1.2, grace=3.0))
@@ -244,17 +259,32 @@ draw_rates(passed, title="Who crosses steps it has never seen?")
 # %% [markdown]
 # ## Does it know what it can do?
 #
-# The Feasibility-Net has learned all along, from the same samples. Its exam is the plot of notebook
-# 03, on held-out ground:
+# The Feasibility-Net has learned all along, from the same samples. Its exam is that of notebook 03:
+# a rollout on held-out ground, labels, and a plot of promise against deed.
 
 # %%
-from fgtutor.evaluation.calibration import CalibrationConfig, drive
-from fgtutor.evaluation.metrics import calibration
-from fgtutor.teach.figures import calibration_plot
+from fgtutor.robots.a1 import A1Env
+from fgtutor.teach.lessons import collect
+from fgtutor.terrain import World
 
 envs = budget(fast=16, full=80, unit="robots, 5 s each", each=0.5)
-held_out = drive(steps, "steps", CalibrationConfig(robot="a1", envs=envs, seconds=5.0))
-calibration_plot(*calibration(held_out.predicted, held_out.measured))
+tiles = [make_terrain("steps", robot="a1", seed=2 * i + 1) for i in range(envs)]
+env = A1Env(World([tiles]), envs, seed=0)
+rollout = collect(env, steps.act, seconds=5.0)
+
+# %%
+import torch
+
+from fgtutor.evaluation.metrics import calibration
+from fgtutor.ppo import feasibility_labels
+from fgtutor.teach.figures import calibration_plot
+
+label, valid = feasibility_labels(rollout["tracking"], round(steps.label_seconds / env.control_dt))
+
+# %%
+with torch.no_grad():
+    promised = steps.feasibility.feasibility(rollout["patch"][valid], rollout["command"][valid])
+calibration_plot(*calibration(promised.numpy(), label[valid].numpy()))
 
 # %% [markdown]
 # *What to see:* do the points lie near the diagonal where many patches are (the bars below)? That

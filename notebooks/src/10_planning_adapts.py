@@ -92,9 +92,13 @@ for name, (_, route) in plans.items():
     print(f"{name:6} {how}")
 
 # %%
+from dataclasses import replace
+
 from fgtutor.teach.lessons import compare_routes
 
-compare_routes(M, {name: route or "refused" for name, (_, route) in plans.items()}, columns=3)
+drawn = {name: "refused" for name in plans}
+drawn |= {name: replace(route, names=("steps",)) for name, route in routes.items()}
+compare_routes(M, drawn, columns=3)
 
 # %% [markdown]
 # *What to see:* do the routes get shorter from left to right? Nobody has told the planner that the
@@ -157,7 +161,7 @@ from fgtutor.execution import FollowConfig
 from fgtutor.teach.a1_lessons import drive_together
 from fgtutor.teach.notebooks import budget
 
-trials = budget(fast=3, full=12, unit="walks for each stage", each=10.0)
+trials = budget(fast=2, full=12, unit="walks for each stage", each=10.0)
 jobs = [(route, terrain, seed) for route in routes.values() for seed in range(trials)]
 walks = drive_together(jobs, stages, config=FollowConfig(patience=1.15, grace=4.0))
 walked = {name: walks[i * trials : (i + 1) * trials] for i, name in enumerate(routes)}

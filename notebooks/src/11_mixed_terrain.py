@@ -124,21 +124,27 @@ draw_table(
 # row does not name its own specialist, ask the route why:
 
 # %%
+from fgtutor import directions
+
 worst = max(route.explain(), key=lambda step: step["cost"])
+heading = directions.NAMES.index(worst["heading"])
 x, y = M.centre_of(*worst["cell"])
 print(f"the step it liked least: at ({x:.1f}, {y:.1f}) m, heading {worst['heading']}")
 for name in zoo:
-    F = view.tensor(name)[worst["cell"]].max()
-    print(f"{name:7} F at best {F:.2f} there")
+    ix, iy = worst["cell"]
+    f, F = (tensor[ix, iy, heading] for tensor in (view.f(name), view.tensor(name)))
+    print(f"{name:7} f = {f:.3f}, with w_ood {F:.3f}")
 
 # %% [markdown]
 # ## Walk
 
 # %%
 from fgtutor import execute
+from fgtutor.execution import FollowConfig
 
+follow = FollowConfig(patience=1.3, grace=4.0)  # who stands still need not stand for minutes
 team = {name: zoo[name] for name in route.names}
-episode = execute(route, terrain, team)
+episode = execute(route, terrain, team, config=follow)
 episode
 
 # %%
@@ -147,8 +153,8 @@ from fgtutor.teach.a1_lessons import show_walk
 show_walk(episode, terrain, route, count=9)
 
 # %% [markdown]
-# *What to see:* the colour of the hull is the policy in charge; the bar at the bottom says who drove
-# when. Compare how it holds itself on the beam and in the valley.
+# *What to see:* the colour of the hull is the policy in charge; the bar at the bottom says who
+# drove when. Compare how it holds itself on the beam and in the valley.
 #
 # The same as a film, beside this notebook. (A film needs a graphics library; the notebook does
 # not.)
@@ -180,11 +186,10 @@ draw_drive(episode, route, M)
 from collections import Counter
 
 from fgtutor.baselines import planners
-from fgtutor.execution import FollowConfig
 from fgtutor.teach.a1_lessons import drive_together
 
 contestants = [*zoo, "ours", *(["general"] if "general" in everyone else [])]
-ways, follow = planners(everyone), FollowConfig(patience=1.3, grace=4.0)
+ways = planners(everyone)
 
 
 def ask(name, view, ground):
@@ -234,11 +239,12 @@ draw_rates(
 # %%
 from tqdm import tqdm
 
-kinds = ["steps", "bridge", "gaps", "valley"][: budget(fast=1, full=4, unit="kinds of ground")]
-grounds = budget(fast=1, full=5, unit="grounds of each kind, two walks on each", each=60.0)
+every = ["steps", "bridge", "gaps", "valley"]
+kinds = every[: budget(fast=1, full=4, unit="of four kinds of ground")]
+count = budget(fast=2, full=10, unit="walks on each", each=7.0 * len(kinds))
 for kind in tqdm(kinds):
     table[kind] = {name: Counter() for name in contestants}
-    for seed in range(101, 101 + 2 * grounds, 2):
+    for seed in range(101, 101 + count, 2):  # two walks on each ground
         ground = corridor(kind, seed)
         result = compete(ground, View(ground.elevation, everyone, "calibrated"), range(2))
         for name in contestants:
@@ -279,5 +285,5 @@ for kind, total in totals.items():
 # - `switch_cost=0.0` is the paper's planning. Count the switches; then walk it.
 # - Plan without headings, `ways["no-heading"]`. On which section does it hurt most, and why there?
 #
-# **Exercises:** [exercises/ex11.ipynb](../exercises/ex11.ipynb). **Next:** nobody gives you the map,
-# [12_from_a_scan_to_a_walk.ipynb](12_from_a_scan_to_a_walk.ipynb).
+# **Exercises:** [exercises/ex11.ipynb](../exercises/ex11.ipynb). **Next:** nobody gives you a
+# map, [12_from_a_scan_to_a_walk.ipynb](12_from_a_scan_to_a_walk.ipynb).

@@ -1,0 +1,167 @@
+"""A specialist dropped into the zoo: what our planner gains by it, and that nothing else changes.
+
+Reads a zoo that holds the newcomer, and the terrain that it is for; gives our success there and on
+the other terrains without and with the newcomer's folder, on the same grounds. Nothing is trained.
+On every ground the tensors of the others are compared, bit for bit.
+Source: paper, Sec. III-C: F_max is a maximum over specialists, so one more only adds to it.
+"""
+
+import hashlib
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from fgtutor.baselines import Layers, View, ours
+from fgtutor.errors import ConfigError, EvaluationError
+from fgtutor.evaluation import success
+from fgtutor.evaluation.report import Share, markdown
+from fgtutor.evaluation.runner import Row
+from fgtutor.evaluation.success import TrialsConfig, by_cell, make_ground, summarise
+from fgtutor.evaluation.trials import drive
+from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo
+from fgtutor.terrain import SCALES
+
+COMMAND = "evaluate newcomer"
+STAGES = ("without", "with")
+"""The zoo before the newcomer's folder is dropped in, and after."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewcomerConfig(TrialsConfig):
+    """Evaluate our planner without and with one of the specialists."""
+
+    newcomer: str = "rubble"
+    """Name of the specialist to leave out and to add; its folder lies in the zoo."""
+    terrain: str | None = None
+    """The terrain that it is for; default: the one that it was trained on."""
+    others: tuple[str, ...] = ()
+    """Terrains that must not suffer; default: the robot's own and mixed."""
+
+    @property
+    def home(self) -> Path:
+        """The zoo's folder."""
+        return self.zoo or ZOO / self.robot
+
+
+def terrains(config: NewcomerConfig) -> tuple[str, ...]:
+    """Return the terrains to evaluate on, the newcomer's first.
+
+    Raises `ConfigError` if the zoo holds no such specialist, or no other.
+    """
+    zoo = load_zoo(config.robot, config.zoo)
+    if config.newcomer not in zoo or len(zoo) == 1:
+        raise ConfigError(
+            f"need a newcomer and others in {config.home}, asked for {config.newcomer!r} of "
+            f"{', '.join(zoo)}: put its folder there, or choose another"
+        )
+    its_own = config.terrain or zoo[config.newcomer].provenance.get("terrain", config.newcomer)
+    return tuple(
+        dict.fromkeys((its_own, *(config.others or (*SCALES[config.robot].mixed, "mixed"))))
+    )
+
+
+def zoos(config: NewcomerConfig) -> Iterator[dict[str, Specialist]]:
+    """Give the zoo without the newcomer's folder and then with it, both read from disk."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        for path in config.home.glob(f"[!._]*/{DESCRIPTION}"):
+            if path.parent.name != config.newcomer:
+                shutil.copytree(path.parent, folder / path.parent.name)
+        yield load_zoo(config.robot, folder)
+        shutil.copytree(config.home / config.newcomer, folder / config.newcomer)
+        yield load_zoo(config.robot, folder)
+
+
+def run_task(
+    config: NewcomerConfig, terrain: str, stages: Sequence[str], indices: Sequence[int]
+) -> list[Row]:
+    """Do one task: some grounds of one terrain, without and with the newcomer."""
+    grounds = [make_ground(config, terrain, index) for index in indices]
+    rows: list[Row] = []
+    for stage, zoo in zip(stages, zoos(config), strict=True):
+        digests: list[dict[str, str]] = []
+        trials = drive(
+            grounds,
+            {stage: partial(_ours_noted, digests)},
+            zoo,
+            taus=config.taus,
+            f_min=config.f_min,
+            switch_cost=config.switch_cost,
+        )
+        # Planned in the order of the grounds, once each.
+        noted = {g.terrain.seed: d for g, d in zip(grounds, digests, strict=True)}
+        rows += ({**asdict(trial), "tensors": noted[trial.ground]} for trial in trials)
+    return rows
+
+
+def _ours_noted(digests: list[dict[str, str]], view: View) -> Sequence[Layers]:
+    """Plan as ours does, and note a digest of each tensor that is planned on."""
+    (layers,) = ours(view)
+    digests.append(
+        {
+            name: hashlib.sha256(tensor.contiguous().numpy().tobytes()).hexdigest()[:16]
+            for name, tensor in layers.items()
+        }
+    )
+    return [layers]
+
+
+def compare_tensors(trials: Sequence[Row], newcomer: str) -> str:
+    """Say how many of the others' tensors were compared, on how many maps.
+
+    Raises `EvaluationError` if one of them is not the same, bit for bit, with the newcomer there.
+    """
+    tensors: dict[str, dict[tuple[str, int], dict[str, str]]] = {stage: {} for stage in STAGES}
+    for trial in trials:
+        tensors[trial["policy"]][trial["terrain"], trial["ground"]] = trial["tensors"]
+    before, after = (tensors[stage] for stage in STAGES)
+    compared = 0
+    for (terrain, ground), mine in before.items():
+        then = after[terrain, ground]
+        changed = [name for name, digest in mine.items() if then.get(name) != digest]
+        if changed:
+            raise EvaluationError(
+                f"on ground {ground} of {terrain}, {newcomer} changed the tensor of "
+                f"{', '.join(changed)}, which may depend on its own folder alone: look for what "
+                "else it reads; the rows are kept"
+            )
+        compared += len(mine)
+    names = dict.fromkeys(name for digests in before.values() for name in digests)
+    return (
+        f"The tensors of {', '.join(names)} are bit-identical without and with {newcomer} on all "
+        f"{len(before):,} maps ({compared:,} pairs compared by sha256)."
+    )
+
+
+def table(trials: Sequence[Row], newcomer: str) -> str:
+    """Return the trials as a Markdown table, a line a terrain, with failures by reason."""
+    cells = by_cell(trials)
+    lines = []
+    for terrain in dict.fromkeys(terrain for terrain, _ in cells):
+        line: list[object] = [terrain]
+        for stage in STAGES:
+            row = summarise(cells[terrain, stage])
+            share = Share(successes=row["successes"], trials=row["trials"])
+            line += [share, " / ".join(str(count) for count in row["failures"].values())]
+        lines.append(line)
+    failures = "no route / fell / timeout"
+    return markdown(
+        ["terrain", f"without {newcomer}, %", failures, f"with {newcomer}, %", failures], lines
+    )
+
+
+def run(config: NewcomerConfig) -> int:
+    """Evaluate from the command line, print the table and write rows and report."""
+    return success.run_and_report(
+        config,
+        COMMAND,
+        title=f"Ours without and with {config.newcomer} ({config.robot})",
+        terrains=terrains(config),
+        policies=STAGES,
+        table=partial(table, newcomer=config.newcomer),
+        work=run_task,
+        remark=partial(compare_tensors, newcomer=config.newcomer),
+    )
