@@ -47,7 +47,7 @@ class DemoConfig:
     """Seed of the robot's start position and yaw."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped ones."""
-    taus: Literal["paper", "calibrated"] = "paper"
+    taus: Literal["paper", "calibrated"] = "calibrated"
     """Thresholds of w_ood: the paper's, or each specialist's own."""
     switch_cost: float = 1.0
     """Extra cost of changing the policy; at the paper's 0 equals take turns from cell to cell."""

@@ -6,7 +6,7 @@ import torch
 
 from fgtutor.errors import ConfigError, StorageError
 from fgtutor.evaluation.calibration import CalibrationConfig, drive, evaluate, report, run
-from fgtutor.specialist import save_specialist
+from fgtutor.specialist import load_zoo, save_specialist
 
 
 @pytest.fixture
@@ -64,3 +64,10 @@ def test_what_cannot_be_checked_is_refused(config, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(StorageError, match="file"):
         run(replace(config, json=tmp_path / "file" / "numbers.json"))
+
+
+def test_the_a1_s_shipped_specialists_can_be_checked():
+    steps = load_zoo("a1")["steps"]
+    driven = drive(steps, "steps", CalibrationConfig(robot="a1", envs=2, seconds=1.6))
+    assert len(driven.predicted) == len(driven.measured) > 20
+    assert driven.measured.min() >= 0 and driven.predicted.std() > 0

@@ -62,7 +62,7 @@ def notebook_with(*outputs) -> nbformat.NotebookNode:
 
 
 def test_the_course_is_built_from_its_sources():
-    assert len(SOURCES) >= 7
+    assert len(SOURCES) == 13
     assert find_drift(COURSE) == {}, "run `fgtutor notebooks`"
 
 

@@ -116,6 +116,20 @@ def test_polyline_keeps_a_gentle_slope_smooth():
     assert vertices[:, 0].tolist() == pytest.approx([0.0, 0.05, 0.15, 0.2])
 
 
+@pytest.mark.parametrize("train", [True, False])
+def test_who_leaves_its_line_has_failed_and_on_a_route_there_is_no_line(train):
+    terrain = Terrain.from_elevation(ElevationMap(FLAT), (1, 1), (2, 1))
+    env = ToyEnv(World([[terrain]]), 3, config=EnvConfig(train=train))
+    poses = torch.tensor([(2.0, 1.5, 0.0)] * 3)
+    poses[:, :2] += env.tile_corner(torch.arange(3))
+    env.start(torch.arange(3), poses, 0.8)
+    env.anchor[1, 1] += 0.9  # its line lies 0.9 m to its left, the third's 1.1 m to its right
+    env.anchor[2, 1] -= 1.1
+    env.step(torch.zeros(3, 4))
+    assert env.tracking[:, 1].tolist() == [0.0, 0.0, float(train)]
+    assert (env.tracking[:, 0] > 0).tolist() == [True, True, not train]
+
+
 def test_lanes_are_far_apart():
     env = on(FLAT, [(1.0, 1.0, 0.0)] * 2)
     assert env.bodies[1][0].position.y - env.bodies[0][0].position.y == pytest.approx(LANE)

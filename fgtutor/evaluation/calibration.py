@@ -66,7 +66,7 @@ class Drive:
     """The mean r_v that followed."""
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def drive(specialist: Specialist, terrain: str, config: CalibrationConfig) -> Drive:
     """Drive a specialist over held-out terrains of full difficulty, with deterministic actions.
 

@@ -51,6 +51,9 @@ class EnvConfig:
     """An episode without `stuck_progress` for this long has failed, s; waiting must not pay."""
     stuck_progress: float = 0.05
     """Progress that counts as moving, m."""
+    stray: float = 1.0
+    """In training a robot this far beside its line has failed, m: r_v, measured in its own frame,
+    does not blame it for turning away from an obstacle and walking well somewhere else."""
     traverse_share: float = 0.6
     """Share of episodes that start at a tile's end and cross it; the others start anywhere."""
     turn_share: float = 0.25
@@ -213,7 +216,7 @@ class LocomotionEnv(VecEnv):
         self.episode_length_buf += 1
         pose, velocity = self.motion()
         fell = self.fallen()
-        failed = fell | self._stuck(pose)
+        failed = fell | self._stuck(pose) | self._strayed(pose)
         r_v = tracking_reward(velocity[:, :2], self.command[:, :2]) * ~failed
         reward = self.reward(r_v, failed)
         self.return_r_v += r_v
@@ -362,18 +365,31 @@ class LocomotionEnv(VecEnv):
             )
             self.anchor = torch.where(turn[:, None], pose[:, :2], self.anchor)
             self.crossing &= ~turn
-        along = torch.stack((torch.cos(self.target_yaw), torch.sin(self.target_yaw)), dim=-1)
-        offset = pose[:, :2] - self.anchor
-        aside = along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]
         ahead = 0.6
-        wanted = self.target_yaw - torch.atan2(aside, torch.tensor(ahead))
+        wanted = self.target_yaw - torch.atan2(self._beside_line(pose), torch.tensor(ahead))
         if self.crossing.any():
-            everyone = torch.arange(self.num_envs, device=self.device)
-            forth = ahead * torch.sign(along[:, 0])
-            lane = self._lane(everyone, pose[:, 0] + forth) + self.aside
-            to_lane = lane + self.tile_corner(everyone)[:, 1] - pose[:, 1]
+            forth = ahead * torch.sign(torch.cos(self.target_yaw))
+            to_lane = -self._beside_lane(pose, forth)
             wanted = torch.where(self.crossing, torch.atan2(to_lane, forth), wanted)
         self.command[:, 2] = turn_rate(wanted, pose[:, 3], self.config.max_turn_rate)
+
+    def _beside_line(self, pose: Tensor) -> Float[Tensor, "envs"]:
+        """Return how far to the left of the straight line from its anchor each robot is, m."""
+        x, y = (pose[:, :2] - self.anchor).unbind(dim=-1)
+        return torch.cos(self.target_yaw) * y - torch.sin(self.target_yaw) * x
+
+    def _beside_lane(self, pose: Tensor, forth: Tensor | float = 0.0) -> Float[Tensor, "envs"]:
+        """Return how far each robot is in y from its way over the tile, `forth` further on, m."""
+        everyone = torch.arange(self.num_envs, device=self.device)
+        lane = self._lane(everyone, pose[:, 0] + forth) + self.aside
+        return pose[:, 1] - lane - self.tile_corner(everyone)[:, 1]
+
+    def _strayed(self, pose: Tensor) -> Bool[Tensor, "envs"]:
+        """Tell which robots have left their line; on a route, keeping it is the follower's task."""
+        if not self.config.train:
+            return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        beside = torch.where(self.crossing, self._beside_lane(pose), self._beside_line(pose))
+        return beside.abs() > self.config.stray
 
     def _stuck(self, pose: Tensor) -> Bool[Tensor, "envs"]:
         moved = (pose[:, :2] - self.stuck_from).norm(dim=-1) > self.config.stuck_progress

@@ -33,7 +33,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.patches import PatchGrid, sample_patches
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.routes import Route
-from fgtutor.teach.canvas import TITLE, Picture
+from fgtutor.teach.canvas import TITLE, Picture, policy_colours
 from fgtutor.teach.charts import INK, colours_of
 from fgtutor.teach.figures import GROUND, draw_elevation, draw_route
 from fgtutor.terrain import Terrain
@@ -268,7 +268,7 @@ def compare_routes(
         if isinstance(route, Route):
             draw_route(route, elevation, axes=axes)
             words = f"{route.length:.1f} m, policy switches: {route.switches}"
-            colours = colours_of(route.names)
+            colours = list(policy_colours(route.names).values())
             used |= {route.names[i]: colours[i] for i in np.unique(route.policies).tolist()}
         axes.set_title(caption, **TITLE, loc="left")
         axes.set_xlabel(str(words), fontsize=9)
@@ -286,7 +286,7 @@ def draw_drive(episode: Episode, route: Route, elevation: ElevationMap) -> Pictu
     axes = figure.axes[0]
     axes.plot(*route.xy.T, color="white", linewidth=7, alpha=0.9, solid_capstyle="round")
     xy = episode.poses[:, :2]
-    colours = colours_of(route.names)
+    colours = list(policy_colours(route.names).values())
     axes.add_collection(
         LineCollection(
             list(np.stack((xy[:-1], xy[1:]), axis=1)),

@@ -259,5 +259,5 @@ for successes in (0, trials // 2, trials):
 #   driven more safely?
 # - Let `roll` of notebook 02 drive a corridor that the plan refused. Was it right to refuse?
 #
-# **Exercises:** [exercises/ex07.ipynb](../exercises/ex07.ipynb). **Next:** a robot with legs.
-# Notebook 08, *Meet the A1*.
+# **Exercises:** [exercises/ex07.ipynb](../exercises/ex07.ipynb). **Next:** a robot with legs,
+# [08 Meet the A1](08_meet_the_a1.ipynb).
