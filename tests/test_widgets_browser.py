@@ -68,6 +68,8 @@ class Page:
         self.errors: list[str] = []
         for domain in ("Runtime", "Log", "Page"):
             self.call(f"{domain}.enable")
+        # JupyterLab knows no current notebook while its window lacks focus, as a headless one does.
+        self.call("Emulation.setFocusEmulationEnabled", enabled=True)
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
         """Call a method of the protocol and return its result; events on the way are noted."""

@@ -140,12 +140,14 @@ def draw_table(
 ) -> Picture:
     """Draw a table of numbers from 0 to 1, the higher the fuller the colour."""
     array = np.asarray(values, dtype=float)
-    figure = Picture(1.8 + 0.85 * len(columns), 1.3 + 0.42 * len(rows))
+    wide = max(1.8 + 0.85 * len(columns), 0.1 * len(title))  # room for the title
+    figure = Picture(wide, 1.3 + 0.42 * len(rows))
     axes = figure.subplots()
     axes.imshow(array, cmap="Blues", vmin=0, vmax=1.25, aspect="auto")
     for (row, column), value in np.ndenumerate(array):
         text = str(texts[row][column]) if texts else f"{value:.2f}"
-        axes.text(column, row, text, ha="center", va="center", fontsize=9, color=INK)
+        ink = "white" if value > 0.65 else INK
+        axes.text(column, row, text, ha="center", va="center", fontsize=9, color=ink)
     axes.set_xticks(range(len(columns)), columns, fontsize=9)
     axes.set_yticks(range(len(rows)), rows, fontsize=9)
     axes.xaxis.tick_top()
