@@ -20,7 +20,7 @@ demo: $(BASE)
 	$(BIN)/fgtutor demo
 
 test: $(ALL) browser
-	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal --durations 20
 
 test-fast: $(ALL)
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal -m "not slow"
