@@ -269,9 +269,11 @@ def find_route(
     *,
     f_min: float = 0.1,
     switch_cost: float = 0.0,
+    cost: str = "inverse",
 ) -> Route:
     """Return the planner's cheapest route; its `names` are the policies that may drive it.
 
+    `cost` is that of `planning.plan`.
     Raises `PlanningError` if there is none, and `ConfigError` if the planner offers no layers.
     """
     routes: list[Route] = []
@@ -287,6 +289,7 @@ def find_route(
                 tensors=layers,
                 f_min=f_min,
                 switch_cost=switch_cost,
+                cost=cost,
             )
         except PlanningError as error:
             refusal = error

@@ -214,3 +214,16 @@ def test_planners_are_those_that_the_zoo_allows(view):
     assert set(everyone) - set(planners(specialists)) == {"general", "traversability", "occupancy"}
     with pytest.raises(ConfigError, match="zoo is empty"):
         find_route(without_fusion, View(view.elevation, {}), (0.1, 0.1), (0.5, 0.5))
+
+
+def test_a_diagonal_step_costs_its_length_if_asked_to(view):
+    flat = View(ground(np.zeros((12, 12))), view.zoo, "calibrated")
+
+    def uniform(view):
+        return [{"steps": torch.full((12, 12, 8), 0.5)}]
+
+    ends = (0.25, 0.25), (0.75, 0.75)  # five cells along each axis
+    counted = find_route(uniform, flat, *ends)
+    measured = find_route(uniform, flat, *ends, cost="length")
+    assert counted.cost == pytest.approx(5 / 0.5)
+    assert measured.cost == pytest.approx(5 * 0.1 * np.sqrt(2) / 0.5)

@@ -90,6 +90,7 @@ def run_task(
             taus=config.taus,
             f_min=config.f_min,
             switch_cost=config.switch_cost,
+            cost=config.cost,
         )
         # Planned in the order of the grounds, once each.
         noted = {g.terrain.seed: d for g, d in zip(grounds, digests, strict=True)}

@@ -58,6 +58,9 @@ class TrialsConfig(RunConfig):
     """Edges less feasible than this do not exist."""
     switch_cost: float = 0.0
     """Extra cost of changing the policy; 0 is the paper's."""
+    cost: Literal["inverse", "length"] = "inverse"
+    """Edge cost: 1 / F (the paper), by which a diagonal step costs as much as a straight one; or
+    1 / F times the step's length, which makes for straighter routes."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped zoo."""
     json: Path | None = None
@@ -167,6 +170,7 @@ def run_task(
         taus=config.taus,
         f_min=config.f_min,
         switch_cost=config.switch_cost,
+        cost=config.cost,
     )
     return [asdict(trial) for trial in trials]
 
@@ -249,7 +253,8 @@ def run_and_report(
     text = table(run.rows)
     caption = (
         f"Success in % with 95 % intervals, {config.count:,} trials a cell; robot {config.robot}, "
-        f"protocol {config.protocol}, tau {config.taus}, switch cost {config.switch_cost:g}, "
+        f"protocol {config.protocol}, tau {config.taus}, cost {config.cost}, "
+        f"switch cost {config.switch_cost:g}, "
         f"seed {config.seed}."
     )
     if remark:

@@ -62,6 +62,7 @@ def drive(
     taus: Taus = "calibrated",
     f_min: float = 0.1,
     switch_cost: float = 0.0,
+    cost: str = "inverse",
     follow: FollowConfig | None = None,
 ) -> list[Trial]:
     """Plan over every ground with every planner, and drive the routes; planner by planner.
@@ -82,6 +83,7 @@ def drive(
                     terrain.goal,
                     f_min=f_min,
                     switch_cost=switch_cost,
+                    cost=cost,
                 )
             except PlanningError:
                 trials += (_trial(terrain, name, seed, "no_route") for seed in ground.seeds)
