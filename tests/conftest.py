@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Callable
+from pathlib import Path
 
 # Before anything imports matplotlib or GitPython: neither may look for a screen or for git.
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -18,7 +19,7 @@ from tensordict import TensorDict
 from fgtutor.feasibility import FeasibilityNet
 from fgtutor.patches import PatchGrid
 from fgtutor.robots.toy import ToyEnv
-from fgtutor.specialist import Specialist
+from fgtutor.specialist import Specialist, save_specialist
 from fgtutor.terrain import World, make_terrain
 
 # Two cores are shared with whatever else runs; small networks are fastest on one thread anyway.
@@ -102,3 +103,11 @@ def make_rolling(make_specialist) -> Callable[..., Specialist]:
         return make_specialist(name, **(values | fields))
 
     return make
+
+
+@pytest.fixture
+def zoo(make_rolling, tmp_path) -> Path:
+    """Three policies that only roll: two say they can, one (gaps) says it can do nothing."""
+    for name, f in (("steps", 0.8), ("gaps", 0.05), ("general", 0.6)):
+        save_specialist(make_rolling(name, f=f), tmp_path / "zoo" / name)
+    return tmp_path / "zoo"

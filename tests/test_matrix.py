@@ -20,16 +20,7 @@ from fgtutor.evaluation.success import (
 )
 from fgtutor.evaluation.trials import Ground, Trial, drive
 from fgtutor.execution import FollowConfig
-from fgtutor.specialist import save_specialist
 from fgtutor.terrain import make_terrain
-
-
-@pytest.fixture
-def zoo(make_rolling, tmp_path):
-    """Three policies that only roll: two say they can, one (gaps) says it can do nothing."""
-    for name, f in (("steps", 0.8), ("gaps", 0.05), ("general", 0.6)):
-        save_specialist(make_rolling(name, f=f), tmp_path / "zoo" / name)
-    return tmp_path / "zoo"
 
 
 @pytest.fixture

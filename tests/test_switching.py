@@ -24,16 +24,7 @@ from fgtutor.evaluation.switching import (
 )
 from fgtutor.fusion import fuse
 from fgtutor.planning import plan
-from fgtutor.specialist import save_specialist
 from fgtutor.terrain import SCALES, make_terrain
-
-
-@pytest.fixture
-def zoo(make_rolling, tmp_path):
-    """Three policies that only roll: two say they can, one (gaps) says it can do nothing."""
-    for name, f in (("steps", 0.8), ("gaps", 0.05), ("general", 0.6)):
-        save_specialist(make_rolling(name, f=f), tmp_path / "zoo" / name)
-    return tmp_path / "zoo"
 
 
 @pytest.fixture
@@ -151,7 +142,8 @@ def test_the_command_drives_reports_and_resumes(config, capsys, monkeypatch):
     for row in rows:
         assert row["ground"] % 2 == 1 and row["seed"] == row["ground"]
         assert (row["course"], row["outcome"], row["switches"]) == ("flat-flat", "reached", 0)
-        assert math.dist(row["end"], goal) <= 0.40  # goal radius, noise
+        # It ends where it believes itself near the goal's cell: off by its noise, if it has any.
+        assert math.dist(row["end"], goal) <= 0.35 + 0.05 * math.sqrt(2) + row["noise"]
     lengths = {
         (row["policy"], row["noise"], row["drift"], row["seed"]): row["length"] for row in rows
     }
@@ -272,4 +264,4 @@ def test_the_command_line_reads_its_options():
     ]
     config = tyro.cli(SwitchingConfig, args=words)
     assert config.levels == ((0.0, 0.0), (0.03, 0.01))
-    assert list(courses(config)) == ["steps-gaps", "full"]
+    assert list(courses(config)) == ["steps-gaps", "full"] and config.switch_cost == 3.0

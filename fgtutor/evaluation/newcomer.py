@@ -21,7 +21,7 @@ from fgtutor.evaluation.report import Share, markdown
 from fgtutor.evaluation.runner import Row
 from fgtutor.evaluation.success import TrialsConfig, by_cell, make_ground, summarise
 from fgtutor.evaluation.trials import drive
-from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo
+from fgtutor.specialist import ZOO, Specialist, load_zoo
 from fgtutor.terrain import SCALES
 
 COMMAND = "evaluate newcomer"
@@ -40,11 +40,6 @@ class NewcomerConfig(TrialsConfig):
     others: tuple[str, ...] = ()
     """Terrains that must not suffer; default: the robot's own and mixed."""
 
-    @property
-    def home(self) -> Path:
-        """The zoo's folder."""
-        return self.zoo or ZOO / self.robot
-
 
 def terrains(config: NewcomerConfig) -> tuple[str, ...]:
     """Return the terrains to evaluate on, the newcomer's first.
@@ -54,8 +49,8 @@ def terrains(config: NewcomerConfig) -> tuple[str, ...]:
     zoo = load_zoo(config.robot, config.zoo)
     if config.newcomer not in zoo or len(zoo) == 1:
         raise ConfigError(
-            f"need a newcomer and others in {config.home}, asked for {config.newcomer!r} of "
-            f"{', '.join(zoo)}: put its folder there, or choose another"
+            f"need a newcomer and others in {config.zoo or ZOO / config.robot}, asked for "
+            f"{config.newcomer!r} of {', '.join(zoo)}: put its folder there, or choose another"
         )
     its_own = config.terrain or zoo[config.newcomer].provenance.get("terrain", config.newcomer)
     return tuple(
@@ -67,11 +62,12 @@ def zoos(config: NewcomerConfig) -> Iterator[dict[str, Specialist]]:
     """Give the zoo without the newcomer's folder and then with it, both read from disk."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        for path in config.home.glob(f"[!._]*/{DESCRIPTION}"):
-            if path.parent.name != config.newcomer:
-                shutil.copytree(path.parent, folder / path.parent.name)
+        paths = {path.name: path for path in config.folders}
+        newcomer = paths.pop(config.newcomer)
+        for other, path in paths.items():
+            shutil.copytree(path, folder / other)
         yield load_zoo(config.robot, folder)
-        shutil.copytree(config.home / config.newcomer, folder / config.newcomer)
+        shutil.copytree(newcomer, folder / config.newcomer)
         yield load_zoo(config.robot, folder)
 
 

@@ -81,16 +81,21 @@ class TrialsConfig(RunConfig):
         """Grounds per terrain."""
         return min(self.count, PAPER_GROUNDS) if self.protocol == "paper" else self.count
 
+    @property
+    def folders(self) -> list[Path]:
+        """The specialists' folders in the zoo."""
+        home = self.zoo or ZOO / self.robot
+        return sorted(path.parent for path in home.glob(f"[!._]*/{DESCRIPTION}"))
+
     def load_zoo(self) -> dict[str, Specialist]:
         """Return the specialists and the generalist, if there is one."""
         return load_zoo(self.robot, self.zoo, include_general=True)
 
     def zoo_digests(self) -> dict[str, str]:
         """Return a digest of each of them, which changes with any of its weights."""
-        home = self.zoo or ZOO / self.robot
         return {
-            path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-            for path in sorted(home.glob(f"[!._]*/{DESCRIPTION}"))
+            folder.name: hashlib.sha256((folder / DESCRIPTION).read_bytes()).hexdigest()[:16]
+            for folder in self.folders
         }
 
 
@@ -254,8 +259,7 @@ def run_and_report(
     caption = (
         f"Success in % with 95 % intervals, {config.count:,} trials a cell; robot {config.robot}, "
         f"protocol {config.protocol}, tau {config.taus}, cost {config.cost}, "
-        f"switch cost {config.switch_cost:g}, "
-        f"seed {config.seed}."
+        f"switch cost {config.switch_cost:g}, seed {config.seed}."
     )
     if remark:
         caption = f"{caption} {remark(run.rows)}"

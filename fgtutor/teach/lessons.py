@@ -34,7 +34,7 @@ from fgtutor.patches import PatchGrid, sample_patches
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.routes import Route
 from fgtutor.teach.canvas import TITLE, Picture, policy_colours
-from fgtutor.teach.charts import INK, colours_of
+from fgtutor.teach.charts import INK
 from fgtutor.teach.figures import GROUND, draw_elevation, draw_route
 from fgtutor.terrain import Terrain
 
@@ -226,7 +226,7 @@ def draw_graph(
     heads = np.array([grid.centre_of(*head) for _, head, _ in edges])
     step = heads - tails
     aside = 0.09 * step @ np.array(((0.0, -1.0), (1.0, 0.0)))  # there and back side by side
-    colours = colours_of(names)
+    colours = list(policy_colours(names).values())
     axes.quiver(
         *(tails + 0.14 * step + aside).T,
         *(0.6 * step).T,
@@ -247,7 +247,7 @@ def draw_graph(
         box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": INK}
         x, y = (a + b) / 2
         axes.text(x, y, f"{weight:.2f}", ha="center", va="center", fontsize=8, bbox=box)
-    _legend(figure, dict(zip(names, colours, strict=True)))
+    _legend(figure, policy_colours(names))
     _say(axes, "The graph: a node a cell, an arrow a step", "The fuller an arrow, the cheaper")
     return figure  # pyright: ignore[reportReturnType]
 
