@@ -371,5 +371,5 @@ OBSTACLES: dict[str, Callable[[Course, float, float], float]] = {
     "rubble": _rubble,
 }
 """Each lays its obstacle over the full width from x0 to x1 and returns the y of the way over it."""
-SPREAD = {"gentle": 0.1, "bridge": 0.03, "valley": 0.15}
+SPREAD = {"gentle": 0.1, "bridge": 0.03, "valley": 0.05}
 """How far beside the way over an obstacle a robot may walk, m; over the others, anywhere."""

@@ -18,8 +18,9 @@ from fgtutor.errors import ConfigError
 
 HOLE_DEPTH = 0.3
 """Depth at which a hole counts as bottomless, m: deeper cells look alike to a patch."""
-HOLE_REACH = 0.4
-"""How far the ground that a hole is measured against may be, m."""
+HOLE_REACH = 0.25
+"""How far the ground that a hole is measured against may be, m: holes are up to twice as wide. Any
+further, and the bottom of a valley with walls of 50 degrees would count as one."""
 SPACING = 0.1
 """Distance between neighbouring points of a patch, m."""
 

@@ -99,8 +99,8 @@ class PlanConfig:
     """Thresholds of w_ood: the paper's, or each specialist's own."""
     f_min: float = 0.1
     """Edges less feasible than this do not exist."""
-    cost: Literal["inverse", "length"] = "inverse"
-    """Edge cost: 1 / F_max, or that times the step's length."""
+    cost: Literal["inverse", "length"] = "length"
+    """Edge cost: 1 / F_max times the step's length, or 1 / F_max alone (the paper)."""
     switch_cost: float = 0.0
     """Extra cost of changing the policy; 0 is the paper's."""
     backend: Literal["auto", "networkx", "scipy"] = "auto"

@@ -58,8 +58,9 @@ class TrainConfig:
     """Difficulty rows of the training world."""
     columns: int = 12
     """Terrain variants per row."""
-    start_row: int = 0
-    """Difficulty row that robots begin on: more for a policy that goes on where another stopped."""
+    easiest: float = 0.1
+    """Difficulty of the first row; that of the last is 1. More for a policy that goes on where
+    another stopped."""
     planning_speed: float = 0.85
     """Forward speed of the command that planning pairs with every patch, m/s."""
     hidden: tuple[int, ...] = (128, 64)
@@ -97,9 +98,12 @@ class TrainConfig:
         for name in ("iterations", "num_envs", "steps", "save_every", "rows", "columns", "threads"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("label_seconds", "hours", "critic_warmup", "start_row"):
+        for name in ("label_seconds", "hours", "critic_warmup"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must be 0 or more, got {getattr(self, name)}")
+
+        if not 0 <= self.easiest <= 1:
+            raise ConfigError(f"easiest must be a difficulty from 0 to 1, got {self.easiest}")
 
     @property
     def folder(self) -> Path:
@@ -154,7 +158,7 @@ def training_world(config: TrainConfig, iteration: int = 0) -> World:
     wherever terrain is evaluated, so nothing is ever evaluated on terrain trained on.
     """
     names = SCALES[config.robot].mixed if config.terrain == "general" else (config.terrain,)
-    levels = np.linspace(0.1, 1.0, config.rows) if config.rows > 1 else np.ones(1)
+    levels = np.linspace(config.easiest, 1.0, config.rows) if config.rows > 1 else np.ones(1)
     dice = np.random.default_rng((config.seed, iteration))
     seeds = 2 * dice.integers(2**30, size=(config.rows, config.columns))
     return World(
@@ -182,7 +186,6 @@ def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
         config=dataclasses.replace(
             make.episodes,
             history=HISTORY if config.actor == "dreamwaq" else 0,
-            start_row=config.start_row,
         ),
         seed=config.seed,
         device=config.device,

@@ -101,7 +101,7 @@ def test_blind_groups_exist_only_if_asked_for(robot):
 
 @robots
 def test_the_history_holds_the_last_frames_of_this_episode(robot):
-    env = make_env(robot, episode_seconds=0.3, traverse_share=0.0, start_row=0)
+    env = make_env(robot, episode_seconds=0.3, traverse_share=0.0)
     felt, ages = list(env.felt), torch.zeros(3, dtype=torch.long)
     env.episode_length_buf[1] = 2  # so that the episodes do not all end together
     observations = env.get_observations()

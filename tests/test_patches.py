@@ -12,6 +12,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.patches import (
     HOLE_DEPTH,
+    SPACING,
     PatchGrid,
     ground_height,
     prepare,
@@ -19,6 +20,7 @@ from fgtutor.patches import (
     sample_heights,
     sample_patches,
 )
+from fgtutor.terrain import make_terrain
 
 GRID = PatchGrid(ahead=0.3, behind=0.1, half_width=0.1, spacing=0.1, footprint=(0.1, 0.1))
 
@@ -138,3 +140,10 @@ def test_prepare_fills_the_unknown_and_levels_the_bottomless():
     ready = prepare(ElevationMap(heights))
     assert ready.heights.min() == pytest.approx(-HOLE_DEPTH)
     assert ready.heights[20, 20] == 0.0 and not ready.known[20, 20]
+
+
+def test_prepare_leaves_the_steepest_valley_as_deep_as_it_is():
+    for seed in range(5):
+        valley = make_terrain("valley", robot="a1", difficulty=1.0, seed=seed).elevation
+        ready, smooth = prepare(valley), valley.filled().smoothed(SPACING)
+        np.testing.assert_allclose(ready.heights, smooth.heights, atol=1e-3)

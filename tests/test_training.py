@@ -311,8 +311,12 @@ def test_the_generalist_trains_on_every_specialty():
     assert all(tile.seed % 2 == 0 for tile in world.tiles[0])
 
 
-def test_robots_begin_on_the_row_that_is_asked_for(tmp_path):
-    trainer = Trainer(TrainConfig(**TINY | {"out": tmp_path / "run", "start_row": 1}))
-    assert trainer.env.row.unique().tolist() == [1]
-    with pytest.raises(ConfigError, match="start_row must be 0 or more"):
-        TrainConfig(start_row=-1)
+def test_rows_rise_from_the_easiest_difficulty_to_the_whole():
+    world = training_world(TrainConfig(terrain="gaps", rows=3, columns=2, easiest=0.5))
+    assert [[tile.difficulty for tile in row] for row in world.tiles] == [
+        [0.5] * 2,
+        [0.75] * 2,
+        [1.0] * 2,
+    ]
+    with pytest.raises(ConfigError, match="easiest must be a difficulty from 0 to 1"):
+        TrainConfig(easiest=1.5)

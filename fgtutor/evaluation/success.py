@@ -58,9 +58,9 @@ class TrialsConfig(RunConfig):
     """Edges less feasible than this do not exist."""
     switch_cost: float = 0.0
     """Extra cost of changing the policy; 0 is the paper's."""
-    cost: Literal["inverse", "length"] = "inverse"
-    """Edge cost: 1 / F (the paper), by which a diagonal step costs as much as a straight one; or
-    1 / F times the step's length, which makes for straighter routes."""
+    cost: Literal["inverse", "length"] = "length"
+    """Edge cost: 1 / F times the step's length; or 1 / F alone (the paper), by which a diagonal
+    step costs as much as a straight one and routes zigzag."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped zoo."""
     json: Path | None = None

@@ -9,6 +9,7 @@ policy that trains on two CPU cores, adds a gait clock and left-right symmetry.
 # MuJoCo's compiled modules carry no type information that pyright could read.
 # pyright: reportAttributeAccessIssue=false
 
+import itertools
 import math
 import warnings
 from dataclasses import fields
@@ -53,8 +54,9 @@ MAX_SLOPE = 0.6
 """Steepest ground a robot is tilted to when it is placed; rise over run."""
 MAX_TILT = 1.2
 """A trunk tilted further than this has fallen, rad."""
-DROP = 0.3
-"""A sole this far below the ground around it has dropped into a hole, m."""
+DROP = 0.35
+"""A sole this far below the ground around it has dropped into a hole, m; at the bottom of a valley
+with walls of 50 degrees it is 0.3 m below the ground that is `RIM` away."""
 RIM = 0.25
 """Half of the widest hole that a foot can drop into while the robot still stands, m."""
 FREE_FALL = 2.0
@@ -108,6 +110,7 @@ class A1Env(LocomotionEnv):
         ground = np.asarray(world.elevation.filled().heights)
         around = 2 * round(RIM / self.resolution) + 1
         self.peaks = torch.as_tensor(maximum_filter(ground, 3), device=device).flatten()
+        self.edges = torch.as_tensor(_edges(ground), device=device).flatten()
         # Closing, unlike a maximum, does not take the foot of a wall for the floor of a hole.
         rims = grey_closing(np.pad(ground, around, mode="edge"), around)
         rims = np.ascontiguousarray(rims[around:-around, around:-around])
@@ -332,7 +335,7 @@ class A1Env(LocomotionEnv):
             a1_terms.stance_share(self.clock),
             force,
             self._feet("foot_velocity").norm(dim=-1),
-            foot[..., 2] - FOOT_RADIUS - self._lookup(self.peaks, foot[..., :2]),
+            foot[..., 2] - FOOT_RADIUS - self._lookup(self.edges, foot[..., :2]),
             self.settings.swing_height,
         )
         terms = {
@@ -368,6 +371,21 @@ def _blocky(elevation: ElevationMap) -> bool:
     """Tell whether most neighbouring cells have equal heights, so that few boxes suffice."""
     heights = np.asarray(elevation.filled().heights)
     return all(float((np.diff(heights, axis=k) == 0).mean()) > 0.9 for k in (0, 1))
+
+
+def _edges(ground: Float[np.ndarray, "nx ny"]) -> Float[np.ndarray, "nx ny"]:
+    """Return the height of each cell or of an edge beside it; a steady slope has no edge.
+
+    The rise to a neighbour counts as far as it exceeds the rise up to here from the other side.
+    """
+    nx, ny = ground.shape
+    padded = np.pad(ground, 1, mode="edge")
+    edge = np.zeros_like(ground)
+    for i, j in itertools.product((-1, 0, 1), repeat=2):
+        ahead = padded[1 + i : 1 + i + nx, 1 + j : 1 + j + ny] - ground
+        behind = ground - padded[1 - i : 1 - i + nx, 1 - j : 1 - j + ny]
+        edge = np.maximum(edge, ahead - behind.clip(min=0.0))
+    return ground + edge
 
 
 def _quaternion(

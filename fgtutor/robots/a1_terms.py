@@ -70,8 +70,11 @@ def mirror() -> Mirror:
 
 PAIR = (0.0, 0.5, 0.5, 0.0)
 """Share of a gait cycle by which each leg lags: a trot moves diagonal legs together."""
-POSTURE = (1.0, 0.1, 0.1) * 4
-"""How much each joint's distance from the stance counts: legs may bend, but not spread."""
+POSTURE = (3.0, 0.1, 0.1) * 4
+"""How much each joint's distance from `NARROW` counts: legs may bend, but not spread."""
+NARROW = (0.2, 0.0, 0.0, -0.2, 0.0, 0.0) * 2
+"""Joint angles relative to the stance that posture asks for, rad: 0.1 rad inward instead of 0.1
+outward at the hips, so that left and right feet fit on 0.25 m of ground instead of 0.35 m."""
 SOFT_LIMIT = 0.95
 """Share of a joint's range in which it may move freely."""
 
@@ -93,7 +96,7 @@ class RewardWeights:
     gait: float = 1.5
     """Stepping with the clock, when moving."""
     posture: float = 0.5
-    """Joints near the stance, when moving."""
+    """Joints near the stance, feet close together, when moving."""
     orientation: float = -2.0
     """Squared sine of the trunk's tilt."""
     bounce: float = -0.5
@@ -155,8 +158,9 @@ def gait(
 
 
 def posture(joints: Float[Tensor, "n 12"]) -> Float[Tensor, "n"]:
-    """Return exp(-sum w q^2) of the joints' distances q from the stance, rad."""
-    return torch.exp(-(joints.square() * torch.tensor(POSTURE, device=joints.device)).sum(dim=-1))
+    """Return exp(-sum w (q - n)^2) of joints q relative to the stance and `NARROW` n, rad."""
+    weight, narrow = (torch.tensor(row, device=joints.device) for row in (POSTURE, NARROW))
+    return torch.exp(-(weight * (joints - narrow).square()).sum(dim=-1))
 
 
 def limits(angles: Float[Tensor, "n 12"]) -> Float[Tensor, "n"]:

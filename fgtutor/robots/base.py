@@ -52,8 +52,9 @@ class EnvConfig:
     stuck_progress: float = 0.05
     """Progress that counts as moving, m."""
     stray: float = 1.0
-    """In training a robot this far beside its line has failed, m: r_v, measured in its own frame,
-    does not blame it for turning away from an obstacle and walking well somewhere else."""
+    """In training a robot this far beside its line has failed, m, and so has one that crosses and
+    turns away by more than 60 degrees: r_v, measured in its own frame, does not blame it for
+    walking well somewhere else."""
     traverse_share: float = 0.6
     """Share of episodes that start at a tile's end and cross it; the others start anywhere."""
     turn_share: float = 0.25
@@ -63,8 +64,6 @@ class EnvConfig:
     demote_below: float = 0.3
     """Mean r_v of a crossing below which its robot moves to an easier row; so does a failure in the
     tile's first half."""
-    start_row: int = 0
-    """Row on which training starts."""
     train: bool = True
     """Draw new episodes when one ends; False leaves finished robots where they are."""
     history: int = 0
@@ -128,7 +127,7 @@ class LocomotionEnv(VecEnv):
         )
 
         self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long, device=device)
-        self.row = torch.full((num_envs,), min(self.config.start_row, self.num_rows - 1))
+        self.row = torch.zeros(num_envs, dtype=torch.long)
         self.column = torch.arange(num_envs) % self.num_columns
         self.command = torch.zeros(num_envs, 3, device=device)
         self.target_yaw = torch.zeros(num_envs, device=device)
@@ -385,11 +384,12 @@ class LocomotionEnv(VecEnv):
         return pose[:, 1] - lane - self.tile_corner(everyone)[:, 1]
 
     def _strayed(self, pose: Tensor) -> Bool[Tensor, "envs"]:
-        """Tell which robots have left their line; on a route, keeping it is the follower's task."""
+        """Tell which robots have left their way; on a route, keeping it is the follower's task."""
         if not self.config.train:
             return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         beside = torch.where(self.crossing, self._beside_lane(pose), self._beside_line(pose))
-        return beside.abs() > self.config.stray
+        away = self.crossing & (torch.cos(pose[:, 3] - self.target_yaw) < 0.5)
+        return (beside.abs() > self.config.stray) | away
 
     def _stuck(self, pose: Tensor) -> Bool[Tensor, "envs"]:
         moved = (pose[:, :2] - self.stuck_from).norm(dim=-1) > self.config.stuck_progress
