@@ -44,6 +44,9 @@ from fgtutor.storage import atomic_write, make_folder
 
 __all__ = ["A1TrainConfig", "TrainConfig", "Trainer", "config_of", "run", "train", "training_world"]
 
+CHECKPOINT = "checkpoint.pt"
+"""The file in a run's folder from which it goes on."""
+
 
 class Trainer:
     """One training run: environment, runner, checkpoints, curves."""
@@ -70,15 +73,16 @@ class Trainer:
             )
         self.algorithm: FeasibilityPPO = self.runner.alg  # type: ignore[assignment]
         self.samples_before = 0
+        self.critic_warmup = 0
         if config.start_from:
-            self._start_from(load_specialist(config.start_from))
+            self._start_from(config.start_from)
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
 
     @property
     def checkpoint(self) -> Path:
         """Where this run's checkpoint lies."""
-        return self.config.folder / "checkpoint.pt"
+        return self.config.folder / CHECKPOINT
 
     @property
     def samples(self) -> int:
@@ -91,8 +95,13 @@ class Trainer:
         seed = distributed.own_seed(self.config.seed)
         return make_training_env(replace(self.config, seed=seed, device="cpu"), self.iteration)
 
-    def _start_from(self, specialist: Specialist) -> None:
-        """Take over a trained policy, all but its action noise; the Feasibility-Net stays new."""
+    def _start_from(self, folder: Path) -> None:
+        """Take over a trained policy, all but its action noise; the Feasibility-Net stays new.
+
+        From a run's folder its critic comes along; otherwise the new one learns first, alone.
+        """
+        checkpoint = folder / CHECKPOINT
+        specialist = load_specialist(folder / "specialist" if checkpoint.exists() else folder)
         mine, start = self.algorithm.get_policy(), specialist.policy
         if specialist.robot != self.config.robot or start.obs_dim != mine.obs_dim:
             raise CheckpointError(
@@ -103,11 +112,17 @@ class Trainer:
         self.samples_before = int(specialist.provenance.get("samples", 0))
         noise = {k: v for k, v in mine.state_dict().items() if k.startswith("distribution")}
         mine.load_state_dict(start.state_dict() | noise)
+        if checkpoint.exists():
+            self.algorithm.critic.load_state_dict(
+                _read(checkpoint)["algorithm"]["critic_state_dict"]
+            )
+        else:
+            self.critic_warmup = self.config.critic_warmup
 
     def iterate(self) -> dict[str, float]:
         """Collect one rollout, learn from it, and return this iteration's numbers."""
-        if self.config.start_from and self.iteration in (0, self.config.critic_warmup):
-            warm = self.iteration < self.config.critic_warmup
+        if self.config.start_from and self.iteration in (0, self.critic_warmup):
+            warm = self.iteration < self.critic_warmup
             self.algorithm.get_policy().requires_grad_(not warm)
             self.algorithm.learning_rate = self.config.learning_rate
         began, done = time.monotonic(), self.iteration / self.config.iterations
@@ -180,16 +195,10 @@ class Trainer:
         path = self.checkpoint
         if not path.exists():
             raise CheckpointError(f"no checkpoint at {path}: start without --resume")
-        try:
-            state = torch.load(path, weights_only=True, map_location="cpu")
-            mine = comparable(self.config)
-            # A setting younger than the checkpoint had what is now its default.
-            stored = comparable(type(self.config)()) | json.loads(state["config"])
-        except Exception as error:
-            raise CheckpointError(
-                f"{path} is not a readable checkpoint ({type(error).__name__}): delete the folder "
-                "and train anew"
-            ) from error
+        state = _read(path)
+        mine = comparable(self.config)
+        # A setting younger than the checkpoint had what is now its default.
+        stored = comparable(type(self.config)()) | state["config"]
         changed = sorted(k for k in mine if stored.get(k) != mine[k])
         if changed:
             what = ", ".join(f"{k} was {stored.get(k)!r}, now {mine[k]!r}" for k in changed)
@@ -204,11 +213,11 @@ class Trainer:
             )
         own = everyone[distributed.rank()]
         self.algorithm.load(state["algorithm"])
-        warm = self.config.start_from and state["iteration"] < self.config.critic_warmup
+        warm = state["iteration"] < self.critic_warmup
         self.algorithm.get_policy().requires_grad_(not warm)
         self.iteration, self.seconds = state["iteration"], state["seconds"]
         self._renew(own["env"])
-        self.history = json.loads(state["history"])
+        self.history = state["history"]
         torch.set_rng_state(own["torch_random"])
 
     def specialist(self) -> Specialist:
@@ -238,6 +247,18 @@ class Trainer:
                 "curve": self.history[::every],
             },
         )
+
+
+def _read(checkpoint: Path) -> dict[str, Any]:
+    """Return what a checkpoint holds."""
+    try:
+        state = torch.load(checkpoint, weights_only=True, map_location="cpu")
+        return state | {name: json.loads(state[name]) for name in ("config", "history")}
+    except Exception as error:
+        raise CheckpointError(
+            f"{checkpoint} is not a readable checkpoint ({type(error).__name__}): delete the "
+            "folder and train anew"
+        ) from error
 
 
 def train(

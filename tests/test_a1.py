@@ -71,10 +71,14 @@ def test_in_training_who_turns_away_or_leaves_its_line_has_failed():
         put(env, (1.0, 2.0, 0.0), (4.0, 2.0, 0.0), (4.0, 3.2, 0.0), (6.0, 2.0, 0.0))
         env.target_yaw[:] = env.target_yaw[0]
         env.crossing[:] = True
+        env.crossing[1] = False  # nor does one that walks straight on from anywhere
         env.aside[:] = 0.0
         turned = env.pose.clone()
         turned[0, 3] += math.radians(62)
-        turned[1, 3] -= math.radians(58)
+        turned[1, 3] -= math.radians(62)
+        turned[3, 3] -= math.radians(58)
+        assert env._strayed(turned).tolist() == [train, train, train, False]
+        env.turning[1] = True  # which has just been told to turn
         assert env._strayed(turned).tolist() == [train, False, train, False]
 
 

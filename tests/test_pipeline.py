@@ -1,4 +1,5 @@
 import json
+import math
 
 import numpy as np
 import pytest
@@ -39,8 +40,8 @@ def test_the_command_plans_and_writes_the_route(case, tmp_path, capsys):
     assert run(PlanConfig(json=tmp_path / "route.json", **case)) == 0
     route = Route.from_json(json.loads((tmp_path / "route.json").read_text()))
     assert route.names == ("sure", "unsure") and set(route.policies) == {0}
-    # 20 steps of f = 0.9; the unknown cell is worth a detour of no extra step.
-    assert route.cost == pytest.approx(20 / 0.9, rel=1e-5)
+    # 18 straight steps and, around the unknown cell, two diagonal ones, all of f = 0.9.
+    assert route.cost == pytest.approx(0.1 * (18 + 2 * math.sqrt(2)) / 0.9, rel=1e-5)
     assert [15, 10] not in route.cells.tolist()
     assert "20 steps" in capsys.readouterr().out
 

@@ -202,6 +202,19 @@ def test_a_run_starts_from_a_trained_policy_with_a_critic_of_its_own(trained, tm
     assert row["samples"] == specialist.provenance["samples"] + 3 * 4 * 8
 
 
+def test_from_a_run_its_critic_comes_along_and_nothing_warms_up(trained, tmp_path):
+    config, specialist, _ = trained
+    settings = TINY | {"iterations": 3, "start_from": config.folder, "easiest": 0.5}
+    trainer = Trainer(TrainConfig(out=tmp_path / "run", **settings))
+    critic = torch.load(config.folder / "checkpoint.pt")["algorithm"]["critic_state_dict"]
+    policy, mine = trainer.algorithm.get_policy(), trainer.algorithm.critic.state_dict()
+    assert critic and all(torch.equal(value, mine[name]) for name, value in critic.items())
+    first = {k: v.clone() for k, v in policy.state_dict().items() if "distribution" not in k}
+    assert all(torch.equal(v, specialist.policy.state_dict()[k].cpu()) for k, v in first.items())
+    trainer.iterate()
+    assert any(not torch.equal(v, policy.state_dict()[k]) for k, v in first.items())
+
+
 def test_starting_from_another_robots_policy_is_refused(trained, tmp_path):
     start = trained[0].folder / "specialist"
     with pytest.raises(CheckpointError, match="drives toy"):

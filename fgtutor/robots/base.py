@@ -52,9 +52,9 @@ class EnvConfig:
     stuck_progress: float = 0.05
     """Progress that counts as moving, m."""
     stray: float = 1.0
-    """In training a robot this far beside its line has failed, m, and so has one that crosses and
-    turns away by more than 60 degrees: r_v, measured in its own frame, does not blame it for
-    walking well somewhere else."""
+    """In training a robot this far beside its line has failed, m, and so has one that shall go
+    straight and turns away by more than 60 degrees: r_v, measured in its own frame, does not blame
+    it for walking well somewhere else."""
     traverse_share: float = 0.6
     """Share of episodes that start at a tile's end and cross it; the others start anywhere."""
     turn_share: float = 0.25
@@ -388,7 +388,8 @@ class LocomotionEnv(VecEnv):
         if not self.config.train:
             return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         beside = torch.where(self.crossing, self._beside_lane(pose), self._beside_line(pose))
-        away = self.crossing & (torch.cos(pose[:, 3] - self.target_yaw) < 0.5)
+        straight = self.crossing | ~self.turning
+        away = straight & (torch.cos(pose[:, 3] - self.target_yaw) < 0.5)
         return (beside.abs() > self.config.stray) | away
 
     def _stuck(self, pose: Tensor) -> Bool[Tensor, "envs"]:
