@@ -77,7 +77,9 @@ def run(config: DemoConfig) -> int:
         weights[name], tensors[name] = assessment.ood(*taus), assessment.weighted(*taus)
         tensors[name][closed] = 0
     ends = terrain.start, terrain.goal
-    plan = plan_on_map(elevation, zoo, *ends, tensors=tensors, switch_cost=config.switch_cost)
+    plan = plan_on_map(
+        elevation, zoo, *ends, tensors=tensors, cost="length", switch_cost=config.switch_cost
+    )
     write_json(config.out / "route.json", plan.route.to_json())
     announce("route.json", str(plan.route))
     save_figure(plan_figure(elevation, plan, weights), config.out / "plan.png")

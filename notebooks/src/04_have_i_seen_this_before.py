@@ -127,7 +127,7 @@ def rebuild(net, patch):
 from fgtutor.evaluation.calibration import CalibrationConfig, drive
 from fgtutor.teach.notebooks import budget
 
-settings = CalibrationConfig(envs=budget(fast=24, full=100, unit="robots", each=0.4), seconds=8.0)
+settings = CalibrationConfig(envs=budget(fast=16, full=100, unit="robots", each=0.4), seconds=8.0)
 drives = {name: drive(specialist, name, settings) for name, specialist in zoo.items()}
 
 

@@ -153,7 +153,7 @@ film_strip(attempts[worst], terrain, alone[planned.names[worst]], count=4)
 from fgtutor.teach.charts import draw_rates
 from fgtutor.teach.notebooks import budget
 
-trials = budget(fast=10, full=50, unit="drives for each error", each=0.3)
+trials = budget(fast=6, full=50, unit="drives for each error", each=0.3)
 rates = {}
 for drift in (0.0, 0.05, 0.15):
     lost = FollowConfig(position_noise=0.02, drift=drift, patience=1.5)
@@ -184,7 +184,7 @@ everyone = load_zoo("toy", include_general=True)
 contestants = [*zoo, "ours", "general", "occupancy+P"]
 chosen = {name: planners(everyone)[name] for name in contestants}
 kinds = ["steps", "gaps", "slopes", "rubble", "mixed"]
-trials = budget(fast=3, full=20, unit="trials a cell, 35 cells", each=14.0)
+trials = budget(fast=2, full=20, unit="trials a cell, 35 cells", each=14.0)
 
 # %%
 from tqdm import tqdm

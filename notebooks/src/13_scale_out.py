@@ -154,7 +154,7 @@ from fgtutor.evaluation.shards import collect, settings_of
 from fgtutor.evaluation.success import TrialsConfig, run_task
 from fgtutor.teach.notebooks import budget
 
-count = budget(fast=3, full=24, unit="grounds", each=2.0)
+count = budget(fast=2, full=24, unit="grounds", each=2.0)
 small, who = TrialsConfig(robot="toy", trials=count), ("slopes", "ours")
 tasks = [
     Task(name=f"ground-{i}", function=run_task, arguments=(small, "slopes", who, [i]))
