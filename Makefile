@@ -82,10 +82,13 @@ $(VENV)/bin/python:
 	echo "Creating $(VENV) with $$found"; \
 	rm -rf $(VENV); $$found -m venv $(VENV)
 
+# Python compiles what is imported when it is imported; compiling everything takes a minute.
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt
+
 $(BASE): pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	$(INSTALL) --editable .
 	@touch $@
 
-$(ALL): pyproject.toml constraints.txt $(BASE)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[lab,dev]'
-	@touch $@
+$(ALL): pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(INSTALL) --editable '.[lab,dev]'
+	@touch $(BASE) $@

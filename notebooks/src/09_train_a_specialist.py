@@ -263,28 +263,13 @@ draw_rates(passed, title="Who crosses steps it has never seen?")
 # a rollout on held-out ground, labels, and a plot of promise against deed.
 
 # %%
-from fgtutor.robots.a1 import A1Env
-from fgtutor.teach.lessons import collect
-from fgtutor.terrain import World
-
-envs = budget(fast=16, full=80, unit="robots, 5 s each", each=0.5)
-tiles = [make_terrain("steps", robot="a1", seed=2 * i + 1) for i in range(envs)]
-env = A1Env(World([tiles]), envs, seed=0)
-rollout = collect(env, steps.act, seconds=5.0)
-
-# %%
-import torch
-
+from fgtutor.evaluation.calibration import CalibrationConfig, drive
 from fgtutor.evaluation.metrics import calibration
-from fgtutor.ppo import feasibility_labels
 from fgtutor.teach.figures import calibration_plot
 
-label, valid = feasibility_labels(rollout["tracking"], round(steps.label_seconds / env.control_dt))
-
-# %%
-with torch.no_grad():
-    promised = steps.feasibility.feasibility(rollout["patch"][valid], rollout["command"][valid])
-calibration_plot(*calibration(promised.numpy(), label[valid].numpy()))
+envs = budget(fast=16, full=80, unit="robots, 5 s each", each=0.5)
+exam = drive(steps, "steps", CalibrationConfig(robot="a1", envs=envs, seconds=5.0))
+calibration_plot(*calibration(exam.predicted, exam.measured))
 
 # %% [markdown]
 # *What to see:* do the points lie near the diagonal where many patches are (the bars below)? That
