@@ -154,10 +154,12 @@ class _Worker:
             self.line.send_bytes(pickle.dumps(task))
 
     def stop(self) -> None:
-        """End the process, whatever it is doing."""
+        """End the process: with a farewell if it waits, without one if it is at work."""
+        self.line.close()
+        if self.task is None:
+            self.process.join(timeout=5.0)
         self.process.terminate()
         self.process.join()
-        self.line.close()
 
 
 def _serve(line: connection.Connection) -> None:
