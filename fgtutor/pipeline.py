@@ -102,7 +102,8 @@ class PlanConfig:
     cost: Literal["inverse", "length"] = "length"
     """Edge cost: 1 / F_max times the step's length, or 1 / F_max alone (the paper)."""
     switch_cost: float = 0.0
-    """Extra cost of changing the policy; 0 is the paper's."""
+    """Extra cost of changing the policy, in the unit of `cost` (metres or steps where F is 1); 0 is
+    the paper's."""
     backend: Literal["auto", "networkx", "scipy"] = "auto"
     """Which library searches."""
     json: Path | None = None

@@ -103,6 +103,12 @@ class TrainConfig:
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must be 0 or more, got {getattr(self, name)}")
 
+        start = self.start_from and self.start_from.resolve()
+        if start in (self.folder.resolve(), (self.folder / "specialist").resolve()):
+            raise ConfigError(
+                f"{self.folder} would be overwritten by the run that starts from it: give another "
+                "--out, or go on with --resume and without --from"
+            )
         if not 0 <= self.easiest <= 1:
             raise ConfigError(f"easiest must be a difficulty from 0 to 1, got {self.easiest}")
 

@@ -106,11 +106,11 @@ def test_what_cannot_be_compared_is_refused(config, make_rolling, tmp_path):
 
 @pytest.mark.slow
 def test_the_shipped_toys_gain_by_the_rubble_specialist(tmp_path):
-    config = NewcomerConfig(others=("rubble",), trials=5, workers=1, out=tmp_path / "report")
+    config = NewcomerConfig(others=("rubble",), trials=10, workers=1, out=tmp_path / "report")
     assert run(config) == 0
     rows = json.loads((tmp_path / "report" / "rows.json").read_text())
     reached = Counter(row["policy"] for row in rows if row["outcome"] == "reached")
-    assert reached["with"] >= 4 and reached["with"] > reached["without"]
+    assert reached["with"] >= 9 and reached["with"] > reached["without"]
     written = (tmp_path / "report" / "table.md").read_text()
     assert "The tensors of gaps, slopes, steps are bit-identical" in written
-    assert "on all 5 maps (15 pairs" in written
+    assert "on all 10 maps (30 pairs" in written

@@ -142,8 +142,8 @@ def test_the_command_drives_reports_and_resumes(config, capsys, monkeypatch):
     for row in rows:
         assert row["ground"] % 2 == 1 and row["seed"] == row["ground"]
         assert (row["course"], row["outcome"], row["switches"]) == ("flat-flat", "reached", 0)
-        # It ends where it believes itself near the goal's cell: off by its noise, if it has any.
-        assert math.dist(row["end"], goal) <= 0.35 + 0.05 * math.sqrt(2) + row["noise"]
+        # The goal's radius, and half a cell from the goal to the middle of its cell.
+        assert math.dist(row["end"], goal) <= 0.40
     lengths = {
         (row["policy"], row["noise"], row["drift"], row["seed"]): row["length"] for row in rows
     }

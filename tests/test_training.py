@@ -215,6 +215,12 @@ def test_from_a_run_its_critic_comes_along_and_nothing_warms_up(trained, tmp_pat
     assert any(not torch.equal(v, policy.state_dict()[k]) for k, v in first.items())
 
 
+@pytest.mark.parametrize("part", ["", "specialist"])
+def test_a_run_does_not_overwrite_what_it_starts_from(tmp_path, part):
+    with pytest.raises(ConfigError, match=r"would be overwritten .* give another --out"):
+        TrainConfig(out=tmp_path, start_from=tmp_path / part)
+
+
 def test_starting_from_another_robots_policy_is_refused(trained, tmp_path):
     start = trained[0].folder / "specialist"
     with pytest.raises(CheckpointError, match="drives toy"):

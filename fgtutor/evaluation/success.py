@@ -57,7 +57,8 @@ class TrialsConfig(RunConfig):
     f_min: float = 0.1
     """Edges less feasible than this do not exist."""
     switch_cost: float = 0.0
-    """Extra cost of changing the policy; 0 is the paper's."""
+    """Extra cost of changing the policy, in the unit of `cost` (metres or steps where F is 1); 0 is
+    the paper's."""
     cost: Literal["inverse", "length"] = "length"
     """Edge cost: 1 / F times the step's length; or 1 / F alone (the paper), by which a diagonal
     step costs as much as a straight one and routes zigzag."""

@@ -226,14 +226,14 @@ def draw_graph(
     heads = np.array([grid.centre_of(*head) for _, head, _ in edges])
     step = heads - tails
     aside = 0.09 * step @ np.array(((0.0, -1.0), (1.0, 0.0)))  # there and back side by side
-    colours = list(policy_colours(names).values())
+    colours = policy_colours(names)
     axes.quiver(
         *(tails + 0.14 * step + aside).T,
         *(0.6 * step).T,
         angles="xy",
         scale_units="xy",
         scale=1,
-        color=[colours[edge["policy"]] for _, _, edge in edges],
+        color=[colours[names[int(edge["policy"])]] for _, _, edge in edges],
         alpha=[0.15 + 0.75 * edge["feasibility"] for _, _, edge in edges],
         width=0.0045,
         headwidth=4,
@@ -247,7 +247,7 @@ def draw_graph(
         box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": INK}
         x, y = (a + b) / 2
         axes.text(x, y, f"{weight:.2f}", ha="center", va="center", fontsize=8, bbox=box)
-    _legend(figure, policy_colours(names))
+    _legend(figure, colours)
     _say(axes, "The graph: a node a cell, an arrow a step", "The fuller an arrow, the cheaper")
     return figure  # pyright: ignore[reportReturnType]
 
