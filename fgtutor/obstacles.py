@@ -76,6 +76,10 @@ class TerrainScale:
     mixed_landing: float = 1.0
     """Flat ground between two obstacles of the mixed terrain, m."""
 
+    def longest(self, kind: str) -> float:
+        """Return how long an obstacle may be, m."""
+        return {"bridge": self.bridge_length, "valley": self.valley_length}.get(kind, self.length)
+
 
 SCALES = {
     "a1": TerrainScale(),  # the paper's steps of 5-15 cm, gaps of 15 cm, beam of 35 cm, 50 degrees

@@ -62,6 +62,9 @@ class TrainConfig:
     easiest: float = 0.1
     """Difficulty of the first row; that of the last is 1. More for a policy that goes on where
     another stopped."""
+    neighbours: float = 0.0
+    """Share of terrains with other obstacles at both ends, a landing away, as on mixed terrain; for
+    a kind that mixed terrain has."""
     planning_speed: float = 0.85
     """Forward speed of the command that planning pairs with every patch, m/s."""
     hidden: tuple[int, ...] = (128, 64)
@@ -109,8 +112,9 @@ class TrainConfig:
                 f"{self.folder} would be overwritten by the run that starts from it: give another "
                 "--out, or go on with --resume and without --from"
             )
-        if not 0 <= self.easiest <= 1:
-            raise ConfigError(f"easiest must be a difficulty from 0 to 1, got {self.easiest}")
+        for name in ("easiest", "neighbours"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
 
     @property
     def folder(self) -> Path:
@@ -130,6 +134,7 @@ class A1TrainConfig(TrainConfig):
     label_seconds: float = 0.8
     rows: int = 10
     columns: int = 5
+    neighbours: float = 0.6
     planning_speed: float = 0.65
     hidden: tuple[int, ...] = (256, 128)
     gamma: float = 0.99
@@ -164,10 +169,12 @@ def training_world(config: TrainConfig, iteration: int = 0) -> World:
     `general` takes the robot's specialties in turn, column by column. Seeds are even here, and odd
     wherever terrain is evaluated, so nothing is ever evaluated on terrain trained on.
     """
-    names = SCALES[config.robot].mixed if config.terrain == "general" else (config.terrain,)
+    mixed = SCALES[config.robot].mixed
+    names = mixed if config.terrain == "general" else (config.terrain,)
     levels = np.linspace(config.easiest, 1.0, config.rows) if config.rows > 1 else np.ones(1)
     dice = np.random.default_rng((config.seed, iteration))
     seeds = 2 * dice.integers(2**30, size=(config.rows, config.columns))
+    between = dice.random((config.rows, config.columns)) < config.neighbours
     return World(
         [
             [
@@ -176,6 +183,7 @@ def training_world(config: TrainConfig, iteration: int = 0) -> World:
                     robot=config.robot,
                     difficulty=float(level),
                     seed=int(seeds[row, column]),
+                    neighbours=bool(between[row, column]) and names[0] in mixed,
                 )
                 for column in range(config.columns)
             ]

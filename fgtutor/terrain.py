@@ -74,12 +74,16 @@ class Terrain:
     """Which obstacle lies where."""
     lane: tuple[Point, ...] = ()
     """A way from start to goal that the terrain was made for: over the beam, along the valley."""
+    limits: tuple[float, float] | None = None
+    """Between which x that way lies, m, if neighbours lie beyond; None is the whole length."""
 
     @property
     def spread(self) -> float:
         """How far beside the lane a robot may walk, m."""
+        x0, x1 = self.limits or (0.0, self.elevation.size[0])
         anywhere = 0.3 * self.elevation.size[1]
-        return min((SPREAD.get(part.name, anywhere) for part in self.sections), default=anywhere)
+        own = [part.name for part in self.sections if x0 <= part.x0 and part.x1 <= x1]
+        return min((SPREAD.get(name, anywhere) for name in own), default=anywhere)
 
     @classmethod
     def from_elevation(
@@ -113,6 +117,7 @@ def make_terrain(
     seed: int = 0,
     resolution: float | None = None,
     scale: TerrainScale | None = None,
+    neighbours: bool = False,
 ) -> Terrain:
     """Make a corridor along x: flat ground, the obstacle over the full width, flat ground.
 
@@ -126,9 +131,12 @@ def make_terrain(
         seed: Any integer from 0.
         resolution: Side of a cell, m; default: the scale's.
         scale: Sizes to use instead of the robot's preset.
+        neighbours: Lay other obstacles of the mixed terrain at both ends, a landing away. For
+            training: the way goes from landing to landing, and sees what a mixed route shows.
 
     Raises:
-        TerrainError: A name is unknown, or a number is out of range.
+        TerrainError: A name is unknown, a number is out of range, or the mixed terrain has no
+            neighbours for this obstacle.
     """
     if name not in TERRAINS:
         raise TerrainError(f"unknown terrain {name!r}: choose one of {', '.join(TERRAINS)}")
@@ -148,17 +156,26 @@ def make_terrain(
     sections: list[Section] = []
     lane: list[Point] = []
     apron, width = course.snap(scale.apron), course.snap(scale.width)
+    plan = _plan_between(course, name) if neighbours else _plan(course, name, apron)
     x = 0.0
-    for kind, x0, x1 in _plan(course, name, apron):
+    for kind, x0, x1 in plan:
         y = OBSTACLES[kind](course, x0, x1)
         course.full(x, x0)
         x = x1
         sections.append(Section(name=kind, x0=x0, y0=0.0, x1=x1, y1=width))
-        # Straight before and after the obstacle: nobody should step onto a beam at an angle.
-        lane += [(x0 - 0.3, y), (x1 + 0.3, y)]
+        if kind == name or name == "mixed":
+            # Straight before and after the obstacle: nobody should step onto a beam at an angle.
+            lane += [(x0 - 0.3, y), (x1 + 0.3, y)]
     length = course.snap(x + apron if name == "mixed" else scale.length)
     course.full(x, length)
     start, goal = (apron / 2, course.middle), (length - apron / 2, course.middle)
+    limits = None
+    if neighbours:
+        (_, x0, x1), (_, y) = plan[1], lane[0]
+        landing = scale.mixed_landing
+        # Just out of the one neighbour, and to where no foot touches the other.
+        start, goal = (x0 - 0.75 * landing, y), (x1 + 0.75 * landing, y)
+        limits = (x0 - 0.85 * landing, x1 + 0.85 * landing)
     return Terrain(
         name=name,
         robot=robot,
@@ -170,13 +187,13 @@ def make_terrain(
         goal=goal,
         sections=tuple(sections),
         lane=(start, *lane, goal),
+        limits=limits,
     )
 
 
 def _plan(course: Course, name: str, apron: float) -> list[tuple[str, float, float]]:
     """Return which obstacle lies from where to where."""
     scale, dice = course.scale, course.dice
-    longest = {"bridge": scale.bridge_length, "valley": scale.valley_length}
     if name != "mixed":
         room = scale.length - 2 * apron
         if room < 1.0:
@@ -184,7 +201,7 @@ def _plan(course: Course, name: str, apron: float) -> list[tuple[str, float, flo
                 f"a terrain of {scale.length:g} m has no room for an obstacle between two aprons "
                 f"of {apron:g} m: choose a length with at least 1 m to spare"
             )
-        length = min(room, longest.get(name, room))
+        length = min(room, scale.longest(name))
         x0 = course.snap(apron + dice.uniform(0.0, room - length))
         return [(name, x0, course.snap(x0 + length))]
     # Lengths vary, their sum does not: all mixed terrains of a robot have the same size.
@@ -196,6 +213,28 @@ def _plan(course: Course, name: str, apron: float) -> list[tuple[str, float, flo
         plan.append((str(kind), course.snap(x), course.snap(x + length)))
         x += length + scale.mixed_landing
     return plan
+
+
+def _plan_between(course: Course, name: str) -> list[tuple[str, float, float]]:
+    """Return where the obstacle lies, and where its neighbours before and after it."""
+    scale, dice = course.scale, course.dice
+    others = [kind for kind in scale.mixed if kind != name]
+    landing = course.snap(scale.mixed_landing)
+    room = scale.length - 4 * landing  # a neighbour is at least as long as a landing
+    if name not in scale.mixed or not others or room < 1.0:
+        raise TerrainError(
+            f"no neighbours for {name!r}: it must be one of {', '.join(scale.mixed)}, not the only "
+            f"one, and a terrain of {scale.length:g} m must have 1 m besides 4 landings"
+        )
+    length = course.snap(min(dice.uniform(0.75, 1.0) * room, scale.longest(name)))
+    x0 = course.snap(2 * landing + dice.uniform(0.0, room - length))
+    x1 = course.snap(x0 + length)
+    before, after = (str(kind) for kind in dice.choice(others, 2))
+    return [
+        (before, 0.0, course.snap(x0 - landing)),
+        (name, x0, x1),
+        (after, course.snap(x1 + landing), course.snap(scale.length)),
+    ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -146,6 +146,22 @@ def test_leaving_the_tile_is_a_time_out_and_not_a_failure(robot):
 
 
 @robots
+def test_between_neighbours_robots_stay_off_them(robot):
+    terrain = make_terrain("gaps", robot=robot, seed=3, neighbours=True)
+    assert terrain.limits is not None
+    env = env_class(robot)(World([[terrain]]), 256, config=EnvConfig())
+    x = env.motion()[0][:, 0] - env.tile_corner(torch.arange(256))[:, 0]
+    assert ((terrain.limits[0] < x) & (x < terrain.limits[1])).all()
+    backwards = torch.cos(env.target_yaw) < 0
+    assert torch.allclose(x[env.crossing & ~backwards], torch.tensor(terrain.start[0]))
+    assert torch.allclose(x[env.crossing & backwards], torch.tensor(terrain.goal[0]))
+    poses = env.motion()[0].clone()
+    poses[:4, 0] += torch.tensor([terrain.limits[k] + s for k in (0, 1) for s in (-0.01, 0.01)])
+    poses[:4, 0] -= x[:4]
+    assert env._outside(poses).nonzero().flatten().tolist() == [0, 3]
+
+
+@robots
 def test_the_curriculum_follows_the_tracking_reward(robot):
     tiles = [[make_terrain("flat", robot=robot, seed=2)] for _ in range(3)]
     env = env_class(robot)(World(tiles), 7, config=EnvConfig())

@@ -173,6 +173,29 @@ def test_every_section_holds_its_obstacle_over_the_full_width(robot: str, seed: 
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("seed", range(4))
+def test_neighbours_are_other_obstacles_a_landing_away(robot: str, seed: int) -> None:
+    scale = SCALES[robot]
+    for name in scale.mixed:
+        terrain = make_terrain(name, robot=robot, seed=seed, neighbours=True)
+        alone = make_terrain(name, robot=robot, seed=seed)
+        assert terrain.elevation.shape == alone.elevation.shape, "they share a World"
+        assert terrain.spread == alone.spread, "the neighbours do not narrow the way"
+        before, own, after = terrain.sections
+        assert own.name == name and name not in (before.name, after.name)
+        assert (before.x0, after.x1) == (0.0, terrain.elevation.size[0])
+        for left, right in ((before, own), (own, after)):
+            landing = terrain.elevation.crop(left.x1, 0.0, right.x0, left.y1)
+            assert landing.size[0] == pytest.approx(scale.mixed_landing)
+            assert not landing.heights.any()
+        limits = terrain.limits
+        assert limits is not None
+        assert before.x1 < limits[0] < terrain.start[0] < own.x0
+        assert own.x1 < terrain.goal[0] < limits[1] < after.x0
+        assert terrain.lane[0] == terrain.start and terrain.lane[-1] == terrain.goal
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("name", (*OBSTACLES, "mixed"))
 def test_the_seed_fixes_the_terrain(name: str, robot: str) -> None:
     first, again, other = (make_terrain(name, robot=robot, seed=seed) for seed in (5, 5, 6))
@@ -296,6 +319,8 @@ def test_resolution_and_scale_can_be_given() -> None:
         ({"resolution": 0.0}, "resolution"),
         ({"resolution": math.nan}, "resolution"),
         ({"scale": replace(SCALES["toy"], length=3.0)}, "no room"),
+        ({"neighbours": True, "name": "stairs"}, "no neighbours for 'stairs'"),
+        ({"neighbours": True, "scale": replace(SCALES["toy"], length=4.5)}, "4 landings"),
     ],
 )
 def test_out_of_range(arguments: dict, message: str) -> None:

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import os
 import signal
@@ -337,5 +338,15 @@ def test_rows_rise_from_the_easiest_difficulty_to_the_whole():
         [0.75] * 2,
         [1.0] * 2,
     ]
-    with pytest.raises(ConfigError, match="easiest must be a difficulty from 0 to 1"):
+    with pytest.raises(ConfigError, match="easiest must lie in"):
         TrainConfig(easiest=1.5)
+
+
+def test_a_share_of_the_terrains_has_neighbours_where_there_can_be_any():
+    config = TrainConfig(terrain="gaps", rows=5, columns=20, neighbours=0.5)
+    tiles = [tile for row in training_world(config).tiles for tile in row]
+    assert 30 < sum(tile.limits is not None for tile in tiles) < 70
+    without = training_world(dataclasses.replace(config, neighbours=0.0)).tiles
+    assert [tile.seed for row in without for tile in row] == [tile.seed for tile in tiles]
+    gentle = training_world(TrainConfig(terrain="gentle", rows=1, columns=4, neighbours=1.0))
+    assert all(tile.limits is None for tile in gentle.tiles[0])

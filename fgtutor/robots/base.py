@@ -309,15 +309,21 @@ class LocomotionEnv(VecEnv):
         return torch.rand(*shape, generator=self.random).to(self.device)
 
     def _lay_lanes(self) -> None:
-        """Tabulate where, at every 0.1 m along each tile, its lane lies."""
+        """Tabulate each tile's ends, and where at every 0.1 m along it its lane lies."""
         x = np.arange(0.0, float(self.tile_size[0]) + 0.1, 0.1)
         tiles = self.world.tiles
         lanes = np.array(
             [[np.interp(x, *np.array(sorted(t.lane)).T) for t in row] for row in tiles]
         )
         spreads = np.array([[tile.spread for tile in row] for row in tiles])
+        whole = (0.0, float(self.tile_size[0]))
+        limits = np.array([[tile.limits or whole for tile in row] for row in tiles])
+        ends = np.array([[(tile.start[0], tile.goal[0]) for tile in row] for row in tiles])
         self.lanes = torch.as_tensor(lanes, dtype=torch.float32, device=self.device)
-        self.spreads = torch.as_tensor(spreads, dtype=torch.float32, device=self.device)
+        self.spreads, self.limits, self.ends = (
+            torch.as_tensor(table, dtype=torch.float32, device=self.device)
+            for table in (spreads, limits, ends)
+        )
 
     def _lane(self, ids: Tensor, x: Tensor) -> Tensor:
         """Return how far to the left of its tile's corner each robot's lane lies at world x, m."""
@@ -329,18 +335,23 @@ class LocomotionEnv(VecEnv):
         """Draw poses: across the tile from one of its ends, or anywhere the ground is level."""
         n, tries = len(ids), 8
         corner = self.tile_corner(ids)
-        length, width = self.tile_size
+        row, column = self.row[ids], self.column[ids]
+        first, last = self.limits[row, column].unbind(-1)
+        width = self.tile_size[1]
         backwards = self._uniform(n) < 0.3
-        x = torch.where(backwards, length - 0.75, torch.full((n,), 0.75))
+        start, goal = self.ends[row, column].unbind(-1)
+        x = torch.where(backwards, goal, start)
         # Near enough to the lane to reach it before the obstacle begins.
-        beside = (self.spreads[self.row[ids], self.column[ids]] + 0.3).clamp(max=0.3 * width)
+        beside = (self.spreads[row, column] + 0.3).clamp(max=0.3 * width)
         y = self._lane(ids, corner[:, 0] + x) + beside * (2 * self._uniform(n) - 1)
         yaw = torch.where(backwards, torch.full((n,), math.pi), torch.zeros(n))
         across = torch.stack((corner[:, 0] + x, corner[:, 1] + y, yaw), dim=-1)
         inside = 0.1 + 0.8 * self._uniform(n, tries, 2)
+        size = torch.stack((last - first, width.expand(n)), dim=-1)
+        corner[:, 0] += first
         eighths = torch.floor(self._uniform(n, tries) * 8)
         anywhere = torch.cat(
-            (corner[:, None] + inside * self.tile_size, eighths[..., None] * (math.pi / 4)), dim=-1
+            (corner[:, None] + inside * size[:, None], eighths[..., None] * (math.pi / 4)), dim=-1
         )
         patch = sample_patches(
             self.heights, anywhere, self.grid, resolution=self.resolution, origin=self.origin
@@ -399,9 +410,10 @@ class LocomotionEnv(VecEnv):
         return self.stuck_steps * self.control_dt > self.config.stuck_seconds
 
     def _outside(self, pose: Tensor) -> Bool[Tensor, "envs"]:
-        """Tell which robots have left their tile for its margin."""
-        local = pose[:, :2] - self.tile_corner(torch.arange(self.num_envs))
-        return ((local < 0.0) | (local > self.tile_size)).any(dim=-1)
+        """Tell which robots have left their tile for its margin, or for a neighbour's obstacle."""
+        x, y = (pose[:, :2] - self.tile_corner(torch.arange(self.num_envs))).unbind(dim=-1)
+        first, last = self.limits[self.row, self.column].unbind(-1)
+        return (x < first) | (x > last) | (y < 0.0) | (y > self.tile_size[1])
 
     def tile_corner(self, ids: Tensor) -> Float[Tensor, "n 2"]:
         """Return the world position of the corner (0, 0) of each robot's present tile, m."""
