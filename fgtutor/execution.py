@@ -36,6 +36,8 @@ class FollowConfig:
     """Time limit as a multiple of route length / speed, plus `grace`."""
     grace: float = 5.0
     """Seconds added to the time limit."""
+    stuck_seconds: float = 10.0
+    """A robot that has come no further on its route for this long has run out of time too, s."""
     hold_steps: int = 3
     """Hysteresis: a policy takes over once it has been wanted for this many control steps."""
     start_noise: float = 0.03
@@ -165,6 +167,7 @@ class _Drive:
             ]
         )
         n = len(routes)
+        self.idle = np.zeros(n, dtype=int)
         self.error = np.zeros((n, 2))
         self.active = np.array([track.policy for track in self.tracks])
         self.waiting = np.zeros(n, dtype=int)
@@ -187,6 +190,7 @@ class _Drive:
         poses: list[list[np.ndarray]] = [[] for _ in range(n)]
         policies: list[list[int]] = [[] for _ in range(n)]
         bodies: list[list[np.ndarray]] = [[] for _ in range(n)]
+        stuck = self.config.stuck_seconds / self.env.control_dt
         with tqdm(total=n, unit="trial", disable=not progress) as bar:
             for step in range(1, math.ceil(self.limits.max()) + 1):
                 self._command(self._pose())
@@ -207,7 +211,7 @@ class _Drive:
                         reason[i] = "fell"
                     elif away <= self.config.goal_radius:
                         reason[i] = "reached"
-                    elif step >= self.limits[i]:
+                    elif step >= self.limits[i] or self.idle[i] >= stuck:
                         reason[i] = "timeout"
                     bar.update(reason[i] is not None)
                 if None not in reason:
@@ -242,7 +246,9 @@ class _Drive:
             believed = pose[:, :2]
         aims = np.zeros(n)
         for i, track in enumerate(self.tracks):
+            before = track.nearest
             track.advance(believed[i])
+            self.idle[i] = self.idle[i] + 1 if track.nearest == before else 0
             aim = track.ahead(config.lookahead) - believed[i]
             aims[i] = math.atan2(aim[1], aim[0]) if np.hypot(*aim) > 1e-3 else pose[i, 3]
             self._choose(i, track.policy)

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -55,11 +56,24 @@ def test_a_ledge_is_a_time_out_and_a_gap_is_a_fall(make_rolling):
     ledge, gap = np.zeros((60, 40)), np.zeros((60, 40))
     ledge[30:], gap[30:34] = 0.2, -1.0
     tasks = [task((1.0, 2.0), (4.5, 2.0), heights) for heights in (ledge, gap)]
-    episodes = execute_batch(*zip(*tasks, strict=True), {"roll": make_rolling()}, seeds=[0, 1])
+    zoo, patient = {"roll": make_rolling()}, FollowConfig(stuck_seconds=math.inf)
+    episodes = execute_batch(*zip(*tasks, strict=True), zoo, seeds=[0, 1], config=patient)
     assert [episode.reason for episode in episodes] == ["timeout", "fell"]
     limit = 3 * tasks[0][0].length / 0.85 + 5
     assert episodes[0].seconds == pytest.approx(limit, abs=0.1)
     assert episodes[1].seconds < 5
+
+
+def test_who_comes_no_further_runs_out_of_time_early(make_rolling):
+    ledge = np.zeros((60, 40))
+    ledge[30:] = 0.2
+    route, terrain = task((1.0, 2.0), (4.5, 2.0), ledge)
+    episode = execute(
+        route, terrain, {"roll": make_rolling()}, config=FollowConfig(stuck_seconds=2)
+    )
+    assert episode.reason == "timeout"
+    assert episode.poses[-1, 0] > 2.4, "it came as far as it could"
+    assert 2 + 1.4 / 0.85 < episode.seconds < 7, "its time limit would be 17 s"
 
 
 def test_a_batch_gives_what_single_trials_give(make_rolling):
