@@ -69,7 +69,6 @@ def test_in_training_who_turns_away_or_leaves_its_line_has_failed():
             n=4, config=dataclasses.replace(A1_EPISODES, train=train, stuck_seconds=math.inf)
         )
         put(env, (1.0, 2.0, 0.0), (4.0, 2.0, 0.0), (4.0, 3.2, 0.0), (6.0, 2.0, 0.0))
-        env.target_yaw[:] = env.target_yaw[0]
         env.crossing[:] = True
         env.crossing[1] = False  # nor does one that walks straight on from anywhere
         env.aside[:] = 0.0
@@ -78,8 +77,20 @@ def test_in_training_who_turns_away_or_leaves_its_line_has_failed():
         turned[1, 3] -= math.radians(62)
         turned[3, 3] -= math.radians(58)
         assert env._strayed(turned).tolist() == [train, train, train, False]
-        env.turning[1] = True  # which has just been told to turn
-        assert env._strayed(turned).tolist() == [train, False, train, False]
+
+
+def test_a_new_heading_must_be_followed_at_some_rate():
+    env = make(n=1, config=dataclasses.replace(A1_EPISODES, train=True, turn_share=0.0))
+    put(env, (4.0, 2.0, 0.0))
+    env.turning[:], env.crossing[:] = False, False
+    env.target_yaw += math.pi / 2
+    stays = env.pose.clone()
+    steps = 0
+    while not env._strayed(stays).any():
+        env._steer()
+        steps += 1
+    # 60 degrees at 0.6 times 1 rad/s.
+    assert steps * env.control_dt == pytest.approx(math.radians(60) / 0.6, abs=0.05)
 
 
 # The robot on the ground --------------------------------------------------------------------------

@@ -66,6 +66,7 @@ A1_EPISODES = EnvConfig(
     max_turn_rate=1.0,
     episode_seconds=20.0,
     stuck_seconds=2.5,
+    start_yaw=0.8,
     promote_above=0.4,
     demote_below=0.15,
 )

@@ -52,9 +52,13 @@ class EnvConfig:
     stuck_progress: float = 0.05
     """Progress that counts as moving, m."""
     stray: float = 1.0
-    """In training a robot this far beside its line has failed, m, and so has one that shall go
-    straight and turns away by more than 60 degrees: r_v, measured in its own frame, does not blame
-    it for walking well somewhere else."""
+    """In training a robot this far beside its line has failed, m, and so has one that heads more
+    than 60 degrees off what it was told: r_v, measured in its own frame, does not blame it for
+    walking well somewhere else."""
+    obedience: float = 0.6
+    """Share of the greatest turn rate at which a robot must at least follow a new heading."""
+    start_yaw: float = 0.15
+    """Greatest angle to the way at which a crossing begins, rad; routes come in at 45 degrees."""
     traverse_share: float = 0.6
     """Share of episodes that start at a tile's end and cross it; the others start anywhere."""
     turn_share: float = 0.25
@@ -131,6 +135,7 @@ class LocomotionEnv(VecEnv):
         self.column = torch.arange(num_envs) % self.num_columns
         self.command = torch.zeros(num_envs, 3, device=device)
         self.target_yaw = torch.zeros(num_envs, device=device)
+        self.told_yaw = torch.zeros(num_envs, device=device)
         self.anchor = torch.zeros(num_envs, 2, device=device)
         self.begin = torch.zeros(num_envs, 2, device=device)
         self.turning = torch.zeros(num_envs, dtype=torch.bool, device=device)
@@ -272,6 +277,7 @@ class LocomotionEnv(VecEnv):
         self.anchor[ids] = poses[:, :2]
         self.begin[ids] = poses[:, :2]
         self.target_yaw[ids] = poses[:, 2]
+        self.told_yaw[ids] = poses[:, 2]
         self.crossing[ids] = False
         self.turning[ids] = False
         self.command[ids] = 0.0
@@ -361,7 +367,8 @@ class LocomotionEnv(VecEnv):
         level = anywhere[torch.arange(n), best]
         crossing = self._uniform(n) < self.config.traverse_share
         poses = torch.where(crossing[:, None], across, level)
-        poses[:, 2] += 0.15 * (2 * self._uniform(n) - 1)
+        askew = torch.where(crossing, self.config.start_yaw, 0.15)
+        poses[:, 2] += askew * (2 * self._uniform(n) - 1)
         return poses, crossing
 
     def _steer(self) -> None:
@@ -382,6 +389,8 @@ class LocomotionEnv(VecEnv):
             to_lane = -self._beside_lane(pose, forth)
             wanted = torch.where(self.crossing, torch.atan2(to_lane, forth), wanted)
         self.command[:, 2] = turn_rate(wanted, pose[:, 3], self.config.max_turn_rate)
+        slowest = self.config.obedience * self.config.max_turn_rate
+        self.told_yaw += self.control_dt * turn_rate(wanted, self.told_yaw, slowest)
 
     def _beside_line(self, pose: Tensor) -> Float[Tensor, "envs"]:
         """Return how far to the left of the straight line from its anchor each robot is, m."""
@@ -399,8 +408,7 @@ class LocomotionEnv(VecEnv):
         if not self.config.train:
             return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         beside = torch.where(self.crossing, self._beside_lane(pose), self._beside_line(pose))
-        straight = self.crossing | ~self.turning
-        away = straight & (torch.cos(pose[:, 3] - self.target_yaw) < 0.5)
+        away = torch.cos(pose[:, 3] - self.told_yaw) < 0.5
         return (beside.abs() > self.config.stray) | away
 
     def _stuck(self, pose: Tensor) -> Bool[Tensor, "envs"]:
