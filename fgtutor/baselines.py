@@ -25,7 +25,7 @@ from fgtutor.fusion import fuse
 from fgtutor.pipeline import plan_on_map
 from fgtutor.routes import Route
 from fgtutor.specialist import GENERAL, Specialist
-from fgtutor.tensorization import Assessment, Taus, assess, resolve_taus, steps_on_known
+from fgtutor.tensorization import Assessment, Taus, assess_all, resolve_taus, steps_on_known
 
 OURS = "ours"
 """The paper's planner: all specialists, fused."""
@@ -174,8 +174,8 @@ class View:
 
     def assessment(self, name: str) -> Assessment:
         """Return f and L_recon of one policy."""
-        if name not in self._known:
-            self._known[name] = assess(self.elevation, self.zoo[name])
+        if not self._known:
+            self._known.update(assess_all(self.elevation, self.zoo))
         return self._known[name]
 
     def f(self, name: str) -> Float[Tensor, "nx ny 8"]:

@@ -21,7 +21,7 @@ from fgtutor.specialist import load_zoo
 from fgtutor.storage import atomic_write, make_folder, write_json
 from fgtutor.teach.figures import plan_figure, save_figure
 from fgtutor.teach.videos import film_strip, save_video
-from fgtutor.tensorization import assess, resolve_taus, steps_on_known
+from fgtutor.tensorization import assess_all, resolve_taus, steps_on_known
 from fgtutor.terrain import Terrain, make_terrain
 
 ROBOT = "toy"
@@ -71,9 +71,8 @@ def run(config: DemoConfig) -> int:
 
     closed = ~torch.from_numpy(steps_on_known(elevation.known))
     weights, tensors = {}, {}
-    for name, specialist in zoo.items():
-        assessment = assess(elevation, specialist)
-        taus = resolve_taus(config.taus, specialist)
+    for name, assessment in assess_all(elevation, zoo).items():
+        taus = resolve_taus(config.taus, zoo[name])
         weights[name], tensors[name] = assessment.ood(*taus), assessment.weighted(*taus)
         tensors[name][closed] = 0
     ends = terrain.start, terrain.goal

@@ -18,7 +18,7 @@ from fgtutor.fusion import fuse
 from fgtutor.planning import Route, plan
 from fgtutor.specialist import Specialist, load_zoo
 from fgtutor.storage import check_writable, write_json
-from fgtutor.tensorization import Taus, tensorize
+from fgtutor.tensorization import Taus, tensorize_all
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +57,11 @@ def plan_on_map(
     """
     if not zoo:
         raise ConfigError("planning needs at least one specialist, the zoo is empty")
-    known = tensors or {}
-    each = [
-        known[name] if name in known else tensorize(elevation, specialist, taus=taus)
-        for name, specialist in zoo.items()
-    ]
+    known = dict(tensors or {})
+    known |= tensorize_all(
+        elevation, {name: one for name, one in zoo.items() if name not in known}, taus=taus
+    )
+    each = [known[name] for name in zoo]
     fused, policy_map = fuse(each)
     route = plan(
         fused,

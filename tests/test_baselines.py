@@ -128,7 +128,7 @@ def test_a_view_gives_what_tensorize_gives_and_computes_it_once(view, monkeypatc
     for name, specialist in view.zoo.items():
         expected = tensorize(view.elevation, specialist, taus="calibrated")
         assert torch.equal(view.tensor(name), expected)
-    monkeypatch.setattr("fgtutor.baselines.assess", None)  # a second call would fail
+    monkeypatch.setattr("fgtutor.baselines.assess_all", None)  # a second call would fail
     assert view.f("steps").shape == (10, 8, 8)
     assert view.specialists == ["gaps", "steps"]
     assert view.radius == 0.1

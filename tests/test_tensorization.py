@@ -12,9 +12,11 @@ from fgtutor.errors import ConfigError, ThresholdError
 from fgtutor.patches import PatchGrid
 from fgtutor.tensorization import (
     assess,
+    assess_all,
     resolve_taus,
     steps_on_known,
     tensorize,
+    tensorize_all,
     why_blocked,
 )
 
@@ -153,6 +155,42 @@ def test_adding_a_policy_leaves_the_others_as_they_were(make_specialist):
     tensorize(elevation, second)
     assert torch.equal(tensorize(elevation, first), alone)
     assert not torch.equal(tensorize(elevation, second), alone)
+
+
+def test_a_team_is_assessed_as_each_policy_alone(make_specialist):
+    elevation = rough(15, 11)
+    team = {
+        "first": make_specialist("first"),
+        "second": make_specialist("second", seed=1),
+        "third": make_specialist("third", grid=ASYMMETRIC, command=(0.3, 0.0, 0.0)),
+    }
+    for name, one in assess_all(elevation, team).items():
+        alone = assess(elevation, team[name])
+        assert torch.equal(one.f, alone.f)
+        assert torch.equal(one.reconstruction, alone.reconstruction)
+    for name, tensor in tensorize_all(elevation, team, taus=(0.1, 5.0)).items():
+        assert torch.equal(tensor, tensorize(elevation, team[name], taus=(0.1, 5.0)))
+
+
+def test_equal_patches_are_assessed_once(make_specialist, monkeypatch):
+    heights = np.zeros((20, 12))
+    heights[10:] = 0.1  # along y all cells look alike, but those near the border
+    elevation, specialist = ElevationMap(heights, resolution=0.1), make_specialist()
+    asked = []
+    plain = specialist.feasibility.reconstruction
+    monkeypatch.setattr(
+        specialist.feasibility, "reconstruction", lambda p: (asked.append(len(p)), plain(p))[1]
+    )
+    assessment = assess(elevation, specialist)
+    assert sum(asked) < 0.1 * 8 * heights.size
+    # What each cell is given is what the network says of the patch there.
+    for heading, yaw in enumerate(directions.YAWS):
+        poses = torch.tensor([[*elevation.centre_of(9, 5), yaw]])
+        surface = torch.as_tensor(heights, dtype=torch.float32)
+        patch = patches.sample_patches(surface, poses, specialist.grid, resolution=0.1)
+        torch.testing.assert_close(
+            assessment.reconstruction[9, 5, heading], plain(patch.float())[0]
+        )
 
 
 def test_tensorize_weighs_f_by_familiarity(make_specialist):

@@ -14,7 +14,7 @@ from fgtutor.evaluation.trials import EPISODES
 from fgtutor.execution import FollowConfig, execute_batch
 from fgtutor.planning import plan
 from fgtutor.specialist import Specialist
-from fgtutor.tensorization import assess
+from fgtutor.tensorization import assess_all
 from fgtutor.terrain import Terrain
 
 
@@ -50,7 +50,7 @@ def estimate(
     torch.set_num_threads(1)  # as in the tasks
     try:
         began = time.perf_counter()
-        assess(sample.elevation, specialist)
+        assess_all(sample.elevation, zoo)
         assessed = time.perf_counter()
         free = np.ones((*sample.elevation.shape, 8))
         route = plan(free, 0 * free, grid=sample.elevation, start=sample.start, goal=sample.goal)
@@ -71,6 +71,6 @@ def estimate(
     return Cost(
         maps=grounds * len(zoo) * len(terrains),
         episodes=episodes * len(terrains),
-        seconds=grounds * len(zoo) * cells * cell_seconds
+        seconds=grounds * cells * cell_seconds
         + episodes * metres / specialist.command[0] * drive_seconds,
     )

@@ -25,7 +25,7 @@ from fgtutor.feasibility import TAU_HIGH, TAU_LOW
 from fgtutor.planning import Planner, Route, Tree
 from fgtutor.specialist import Specialist
 from fgtutor.teach.corridor import Corridor
-from fgtutor.tensorization import Assessment, assess, steps_on_known
+from fgtutor.tensorization import Assessment, assess_all, steps_on_known
 
 Cell = tuple[int, int]
 Point = tuple[float, float]
@@ -84,9 +84,10 @@ class Explorer:
         if not zoo:
             raise ConfigError("an Explorer needs at least one specialist, the zoo is empty")
         self.elevation, self.names = elevation, tuple(zoo)
-        said = [
-            one if isinstance(one, Assessment) else assess(elevation, one) for one in zoo.values()
-        ]
+        given = {name: one for name, one in zoo.items() if isinstance(one, Assessment)}
+        asked = {name: one for name, one in zoo.items() if not isinstance(one, Assessment)}
+        known = given | assess_all(elevation, asked)
+        said = [known[name] for name in zoo]
         self._f = self._layers([one.f.numpy() for one in said])
         # A step from or to a cell that was never observed is closed, as in `tensorize`.
         self._f *= np.moveaxis(steps_on_known(elevation.known), -1, 0)
