@@ -19,7 +19,8 @@ from tqdm import tqdm
 from fgtutor.errors import ConfigError
 from fgtutor.planning import Route
 from fgtutor.robots import env_class
-from fgtutor.robots.base import LocomotionEnv, turn_rate
+from fgtutor.robots.base import LocomotionEnv
+from fgtutor.robots.commands import turn_rate
 from fgtutor.specialist import Specialist
 from fgtutor.terrain import Terrain, World
 

@@ -73,9 +73,9 @@ def test_in_training_who_turns_away_or_leaves_its_line_has_failed():
         env.crossing[1] = False  # nor does one that walks straight on from anywhere
         env.aside[:] = 0.0
         turned = env.pose.clone()
-        turned[0, 3] += math.radians(62)
-        turned[1, 3] -= math.radians(62)
-        turned[3, 3] -= math.radians(58)
+        turned[0, 3] += math.radians(47)
+        turned[1, 3] -= math.radians(47)
+        turned[3, 3] -= math.radians(43)
         assert env._strayed(turned).tolist() == [train, train, train, False]
 
 
@@ -89,8 +89,18 @@ def test_a_new_heading_must_be_followed_at_some_rate():
     while not env._strayed(stays).any():
         env._steer()
         steps += 1
-    # 60 degrees at 0.6 times 1 rad/s.
-    assert steps * env.control_dt == pytest.approx(math.radians(60) / 0.6, abs=0.05)
+    # 45 degrees at 0.8 times 1 rad/s.
+    assert steps * env.control_dt == pytest.approx(math.radians(45) / 0.8, abs=0.05)
+
+
+def test_velocity_counts_along_the_heading_told():
+    for train, expected in ((True, [[0.0, 0.6], [0.6, 0.0]]), (False, [[0.6, 0.0]] * 2)):
+        env = make(n=2, config=dataclasses.replace(A1_EPISODES, train=train))
+        put(env, (2.0, 2.0, math.pi / 2), (4.0, 2.0, 1.0))
+        env.told_yaw[:] = torch.tensor([0.0, 1.0])  # the first walks off to the left
+        velocity = torch.tensor([[0.6, 0.0, 0.0]] * 2)
+        along = env.along_heading(env.pose, velocity)
+        torch.testing.assert_close(along, torch.tensor(expected), atol=1e-4, rtol=0)
 
 
 # The robot on the ground --------------------------------------------------------------------------

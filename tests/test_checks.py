@@ -19,7 +19,7 @@ from fgtutor.planning import as_networkx, as_switching_networkx, plan
 from fgtutor.ppo import feasibility_labels
 from fgtutor.robots import a1_model
 from fgtutor.robots.a1_bodies import A1EnvConfig
-from fgtutor.robots.base import tracking_reward, turn_rate
+from fgtutor.robots.commands import tracking_reward, turn_rate
 from fgtutor.teach.checks import ex08, find
 from fgtutor.tensorization import assess
 

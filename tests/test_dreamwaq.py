@@ -20,7 +20,7 @@ from fgtutor.recipe import A1TrainConfig, TrainConfig
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.robots.a1 import A1Env, A1EnvConfig
 from fgtutor.robots.a1_model import MIRROR, MIRROR_SIGNS
-from fgtutor.robots.base import EnvConfig
+from fgtutor.robots.commands import EnvConfig
 from fgtutor.robots.toy import ToyEnv
 from fgtutor.specialist import load_specialist, save_specialist
 from fgtutor.symmetry import Mirror

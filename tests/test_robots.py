@@ -9,7 +9,7 @@ from fgtutor import patches
 from fgtutor.errors import ConfigError
 from fgtutor.patches import sample_patches
 from fgtutor.robots import ROBOTS, env_class
-from fgtutor.robots.base import EnvConfig, tracking_reward, turn_rate
+from fgtutor.robots.commands import EnvConfig, tracking_reward, turn_rate
 from fgtutor.terrain import World, make_terrain
 
 robots = pytest.mark.parametrize("robot", sorted(ROBOTS))

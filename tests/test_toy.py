@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from fgtutor.elevation import ElevationMap
-from fgtutor.robots.base import EnvConfig
+from fgtutor.robots.commands import EnvConfig
 from fgtutor.robots.toy import LANE, ToyEnv, polyline
 from fgtutor.terrain import Terrain, World
 

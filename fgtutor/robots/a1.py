@@ -40,7 +40,8 @@ from fgtutor.robots.a1_terms import (
     SCAN_NOISE,
     SCAN_SCALE,
 )
-from fgtutor.robots.base import EnvConfig, LocomotionEnv
+from fgtutor.robots.base import LocomotionEnv
+from fgtutor.robots.commands import EnvConfig
 from fgtutor.robots.physics import Physics
 from fgtutor.terrain import World
 
@@ -66,6 +67,7 @@ A1_EPISODES = EnvConfig(
     max_turn_rate=1.0,
     episode_seconds=20.0,
     stuck_seconds=2.5,
+    obedience=0.8,
     start_yaw=0.8,
     promote_above=0.4,
     demote_below=0.15,
@@ -327,7 +329,8 @@ class A1Env(LocomotionEnv):
 
     def reward_terms(self) -> dict[str, Float[Tensor, "envs"]]:
         """Return each weighted term of the step just taken, per second."""
-        wrong = (self.velocity[:, :2] - self.command[:, :2]).norm(dim=-1)
+        velocity = self.along_heading(self.pose, self.velocity)
+        wrong = (velocity - self.command[:, :2]).norm(dim=-1)
         turn = self.velocity[:, 2] - self.command[:, 2]
         style = a1_terms.moving(wrong)
         force = self._feet("foot_force").norm(dim=-1)

@@ -9,7 +9,6 @@ Source: paper, Sec. III-A (Eq. 1); world of difficulty rows as in Rudin et al., 
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,55 +22,9 @@ from fgtutor import patches
 from fgtutor.dreamwaq import VELOCITY, History
 from fgtutor.errors import ConfigError
 from fgtutor.patches import PatchGrid, sample_patches
+from fgtutor.robots.commands import EnvConfig, tracking_reward, turn_rate
 from fgtutor.symmetry import Mirror
 from fgtutor.terrain import World
-
-SIGMA = 0.25
-"""Scale of the tracking reward, m/s (paper, Eq. 1)."""
-
-
-def tracking_reward(
-    velocity: Float[Tensor, "*batch 2"], command: Float[Tensor, "*batch 2"], sigma: float = SIGMA
-) -> Float[Tensor, "*batch"]:
-    """Return r_v = exp(-||v - v_cmd||_2 / sigma), in (0, 1] (paper, Eq. 1: the norm, unsquared)."""
-    return torch.exp(-(velocity - command).norm(dim=-1) / sigma)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EnvConfig:
-    """How episodes are drawn and ended; the robot's own numbers live beside the robot."""
-
-    speed: tuple[float, float] = (0.7, 1.0)
-    """Range of the commanded forward speed, m/s."""
-    max_turn_rate: float = 1.5
-    """Limit of the commanded turn rate, rad/s."""
-    episode_seconds: float = 8.0
-    """Time limit of an episode, s."""
-    stuck_seconds: float = 2.0
-    """An episode without `stuck_progress` for this long has failed, s; waiting must not pay."""
-    stuck_progress: float = 0.05
-    """Progress that counts as moving, m."""
-    stray: float = 1.0
-    """In training a robot this far beside its line has failed, m, and so has one that heads more
-    than 60 degrees off what it was told: r_v, measured in its own frame, does not blame it for
-    walking well somewhere else."""
-    obedience: float = 0.6
-    """Share of the greatest turn rate at which a robot must at least follow a new heading."""
-    start_yaw: float = 0.15
-    """Greatest angle to the way at which a crossing begins, rad; routes come in at 45 degrees."""
-    traverse_share: float = 0.6
-    """Share of episodes that start at a tile's end and cross it; the others start anywhere."""
-    turn_share: float = 0.25
-    """Share of episodes whose heading changes on the way, as a route's does."""
-    promote_above: float = 0.5
-    """Mean r_v of an unfailed episode from which its robot moves to a harder row."""
-    demote_below: float = 0.3
-    """Mean r_v of a crossing below which its robot moves to an easier row; so does a failure in the
-    tile's first half."""
-    train: bool = True
-    """Draw new episodes when one ends; False leaves finished robots where they are."""
-    history: int = 0
-    """Frames that a blind policy remembers; with any, there are groups `history` and `critic`."""
 
 
 def plain_tensors(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -221,7 +174,7 @@ class LocomotionEnv(VecEnv):
         pose, velocity = self.motion()
         fell = self.fallen()
         failed = fell | self._stuck(pose) | self._strayed(pose)
-        r_v = tracking_reward(velocity[:, :2], self.command[:, :2]) * ~failed
+        r_v = tracking_reward(self.along_heading(pose, velocity), self.command[:, :2]) * ~failed
         reward = self.reward(r_v, failed)
         self.return_r_v += r_v
         truncated = (self.episode_length_buf >= self.max_episode_length) | self._outside(pose)
@@ -389,8 +342,8 @@ class LocomotionEnv(VecEnv):
             to_lane = -self._beside_lane(pose, forth)
             wanted = torch.where(self.crossing, torch.atan2(to_lane, forth), wanted)
         self.command[:, 2] = turn_rate(wanted, pose[:, 3], self.config.max_turn_rate)
-        slowest = self.config.obedience * self.config.max_turn_rate
-        self.told_yaw += self.control_dt * turn_rate(wanted, self.told_yaw, slowest)
+        expected = self.config.obedience * self.config.max_turn_rate
+        self.told_yaw += self.control_dt * turn_rate(wanted, self.told_yaw, expected)
 
     def _beside_line(self, pose: Tensor) -> Float[Tensor, "envs"]:
         """Return how far to the left of the straight line from its anchor each robot is, m."""
@@ -408,8 +361,22 @@ class LocomotionEnv(VecEnv):
         if not self.config.train:
             return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         beside = torch.where(self.crossing, self._beside_lane(pose), self._beside_line(pose))
-        away = torch.cos(pose[:, 3] - self.told_yaw) < 0.5
+        away = torch.cos(pose[:, 3] - self.told_yaw) < math.cos(math.pi / 4)
         return (beside.abs() > self.config.stray) | away
+
+    def along_heading(
+        self, pose: Float[Tensor, "envs 4"], velocity: Float[Tensor, "envs 3"]
+    ) -> Float[Tensor, "envs 2"]:
+        """Return the planar velocity along and across the heading that each robot was told.
+
+        In its own frame, a robot that turns away from an obstacle and walks off would track its
+        command perfectly. On a route, the heading is the follower's to correct.
+        """
+        if not self.config.train:
+            return velocity[:, :2]
+        off = pose[:, 3] - self.told_yaw
+        cos, sin, (vx, vy) = torch.cos(off), torch.sin(off), velocity[:, :2].unbind(-1)
+        return torch.stack((cos * vx - sin * vy, sin * vx + cos * vy), dim=-1)
 
     def _stuck(self, pose: Tensor) -> Bool[Tensor, "envs"]:
         moved = (pose[:, :2] - self.stuck_from).norm(dim=-1) > self.config.stuck_progress
@@ -442,9 +409,3 @@ class LocomotionEnv(VecEnv):
         half = self.num_rows // 2
         anywhere = half + torch.floor(self._uniform(len(ids)) * (self.num_rows - half)).long()
         self.row[ids] = torch.where(row >= self.num_rows, anywhere, row.clamp(min=0))
-
-
-def turn_rate(wanted: Tensor, yaw: Tensor, limit: float, gain: float = 3.0) -> Tensor:
-    """Return the turn rate (rad/s) that closes the yaw error the shorter way, within `limit`."""
-    error = torch.remainder(wanted - yaw + math.pi, 2 * math.pi) - math.pi
-    return (gain * error).clamp(-limit, limit)

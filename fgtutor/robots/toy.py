@@ -22,7 +22,8 @@ from pymunk.constraints import DampedSpring, GrooveJoint, SimpleMotor
 from torch import Tensor
 
 from fgtutor.patches import PatchGrid, sample_heights
-from fgtutor.robots.base import EnvConfig, LocomotionEnv
+from fgtutor.robots.base import LocomotionEnv
+from fgtutor.robots.commands import EnvConfig
 from fgtutor.terrain import World
 
 LANE = 1000.0

@@ -24,7 +24,7 @@
 
 # %%
 from fgtutor import make_terrain
-from fgtutor.robots.base import EnvConfig
+from fgtutor.robots.commands import EnvConfig
 from fgtutor.robots.toy import ToyEnv
 from fgtutor.terrain import World
 
@@ -118,7 +118,7 @@ film_strip(flailing, terrain, route, count=6)
 # norm is not squared.
 
 # %%
-from fgtutor.robots.base import tracking_reward
+from fgtutor.robots.commands import tracking_reward
 from fgtutor.teach.charts import draw_curves
 
 v_hat = torch.tensor([0.85, 0.0])
