@@ -162,6 +162,21 @@ def test_between_neighbours_robots_stay_off_them(robot):
 
 
 @robots
+def test_crossings_begin_askew_towards_their_lane(robot):
+    terrain = make_terrain("bridge", robot=robot, seed=3)
+    env = env_class(robot)(World([[terrain]]), 512, config=EnvConfig(start_yaw=0.8))
+    across = env.crossing
+    ahead = torch.where(torch.cos(env.target_yaw) > 0, 0.0, math.pi)
+    angle = torch.remainder(env.target_yaw - ahead + math.pi, 2 * math.pi) - math.pi
+    assert 0.6 < angle[across].abs().max() < 0.81
+    # Seen along the way, who stands left of the lane heads to the right.
+    left = env._beside_lane(env.motion()[0]) + env.aside
+    left = left * torch.cos(ahead)
+    steep = across & (angle.abs() > 0.16) & (left.abs() > 0.01)
+    assert steep.sum() > 100 and (torch.sign(angle) == -torch.sign(left))[steep].all()
+
+
+@robots
 def test_the_curriculum_follows_the_tracking_reward(robot):
     tiles = [[make_terrain("flat", robot=robot, seed=2)] for _ in range(3)]
     env = env_class(robot)(World(tiles), 7, config=EnvConfig())

@@ -302,7 +302,8 @@ class LocomotionEnv(VecEnv):
         x = torch.where(backwards, goal, start)
         # Near enough to the lane to reach it before the obstacle begins.
         beside = (self.spreads[row, column] + 0.3).clamp(max=0.3 * width)
-        y = self._lane(ids, corner[:, 0] + x) + beside * (2 * self._uniform(n) - 1)
+        beside = beside * (2 * self._uniform(n) - 1)
+        y = self._lane(ids, corner[:, 0] + x) + beside
         yaw = torch.where(backwards, torch.full((n,), math.pi), torch.zeros(n))
         across = torch.stack((corner[:, 0] + x, corner[:, 1] + y, yaw), dim=-1)
         inside = 0.1 + 0.8 * self._uniform(n, tries, 2)
@@ -320,8 +321,11 @@ class LocomotionEnv(VecEnv):
         level = anywhere[torch.arange(n), best]
         crossing = self._uniform(n) < self.config.traverse_share
         poses = torch.where(crossing[:, None], across, level)
-        askew = torch.where(crossing, self.config.start_yaw, 0.15)
-        poses[:, 2] += askew * (2 * self._uniform(n) - 1)
+        # Askew towards the lane, as a route comes to it; a little to either side elsewhere.
+        slight, share = 0.15, self._uniform(n)
+        to_lane = -torch.sign(beside * torch.cos(poses[:, 2]))
+        askew = to_lane * ((self.config.start_yaw + slight) * share - slight)
+        poses[:, 2] += torch.where(crossing, askew, slight * (2 * share - 1))
         return poses, crossing
 
     def _steer(self) -> None:
