@@ -20,7 +20,7 @@ from fgtutor.errors import ConfigError
 from fgtutor.planning import Route
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.robots.commands import turn_rate
+from fgtutor.robots.commands import LOOKAHEAD, turn_rate
 from fgtutor.specialist import Specialist
 from fgtutor.terrain import Terrain, World
 
@@ -29,7 +29,7 @@ from fgtutor.terrain import Terrain, World
 class FollowConfig:
     """How a route is followed, and when an episode is over."""
 
-    lookahead: float = 0.45
+    lookahead: float = LOOKAHEAD
     """Distance to the point on the route that the robot steers for, m."""
     goal_radius: float = 0.35
     """The goal is reached within this distance of it, m."""

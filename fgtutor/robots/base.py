@@ -22,7 +22,7 @@ from fgtutor import patches
 from fgtutor.dreamwaq import VELOCITY, History
 from fgtutor.errors import ConfigError
 from fgtutor.patches import PatchGrid, sample_patches
-from fgtutor.robots.commands import EnvConfig, tracking_reward, turn_rate
+from fgtutor.robots.commands import LOOKAHEAD, EnvConfig, bearing, tracking_reward, turn_rate
 from fgtutor.symmetry import Mirror
 from fgtutor.terrain import World
 
@@ -339,12 +339,12 @@ class LocomotionEnv(VecEnv):
             )
             self.anchor = torch.where(turn[:, None], pose[:, :2], self.anchor)
             self.crossing &= ~turn
-        ahead = 0.6
-        wanted = self.target_yaw - torch.atan2(self._beside_line(pose), torch.tensor(ahead))
+        wanted = self.target_yaw - bearing(self._beside_line(pose))
         if self.crossing.any():
-            forth = ahead * torch.sign(torch.cos(self.target_yaw))
-            to_lane = -self._beside_lane(pose, forth)
-            wanted = torch.where(self.crossing, torch.atan2(to_lane, forth), wanted)
+            forth = torch.sign(torch.cos(self.target_yaw))
+            beside = forth * self._beside_lane(pose, LOOKAHEAD * forth)
+            ahead = torch.where(forth > 0, 0.0, math.pi)
+            wanted = torch.where(self.crossing, ahead - bearing(beside), wanted)
         self.command[:, 2] = turn_rate(wanted, pose[:, 3], self.config.max_turn_rate)
         expected = self.config.obedience * self.config.max_turn_rate
         self.told_yaw += self.control_dt * turn_rate(wanted, self.told_yaw, expected)
