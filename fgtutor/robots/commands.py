@@ -1,0 +1,78 @@
+"""What robots are told and how well they do it: episodes' settings, r_v, and turning to a heading.
+
+Reads velocities and headings; gives the tracking reward and turn rates. Shared by training, where
+episodes are drawn, and by execution, where a route is followed. Source: paper, Sec. III-A (Eq. 1).
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SIGMA = 0.25
+"""Scale of the tracking reward, m/s (paper, Eq. 1)."""
+
+
+LOOKAHEAD = 0.45
+"""Distance to the point on its line that a robot steers for, m, in training as on a route."""
+
+
+def tracking_reward(
+    velocity: Float[Tensor, "*batch 2"], command: Float[Tensor, "*batch 2"], sigma: float = SIGMA
+) -> Float[Tensor, "*batch"]:
+    """Return r_v = exp(-||v - v_cmd||_2 / sigma), in (0, 1] (paper, Eq. 1: the norm, unsquared)."""
+    return torch.exp(-(velocity - command).norm(dim=-1) / sigma)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """How episodes are drawn and ended; the robot's own numbers live beside the robot."""
+
+    speed: tuple[float, float] = (0.7, 1.0)
+    """Range of the commanded forward speed, m/s."""
+    max_turn_rate: float = 1.5
+    """Limit of the commanded turn rate, rad/s."""
+    episode_seconds: float = 8.0
+    """Time limit of an episode, s."""
+    stuck_seconds: float = 2.0
+    """An episode without `stuck_progress` for this long has failed, s; waiting must not pay."""
+    stuck_progress: float = 0.05
+    """Progress that counts as moving, m."""
+    stray: float = 1.0
+    """In training a robot this far beside its line has failed, m, and so has one that heads more
+    than 45 degrees off the heading that it was told."""
+    obedience: float = 1.0
+    """Share of the greatest turn rate at which a robot is expected to follow a new heading."""
+    start_yaw: float = 0.15
+    """Greatest angle at which a crossing comes to its lane, rad; routes do at 45 degrees."""
+    traverse_share: float = 0.6
+    """Share of episodes that start at a tile's end and cross it; the others start anywhere."""
+    turn_share: float = 0.25
+    """Share of episodes whose heading changes on the way, as a route's does."""
+    promote_above: float = 0.5
+    """Mean r_v of an unfailed episode from which its robot moves to a harder row."""
+    demote_below: float = 0.3
+    """Mean r_v of a crossing below which its robot moves to an easier row; so does a failure in the
+    tile's first half."""
+    train: bool = True
+    """Draw new episodes when one ends; False leaves finished robots where they are."""
+    history: int = 0
+    """Frames that a blind policy remembers; with any, there are groups `history` and `critic`."""
+
+
+def bearing(beside: Float[Tensor, "envs"]) -> Float[Tensor, "envs"]:
+    """Return by how much to head to the right of a line's direction to come back to it, rad.
+
+    `beside` is how far to the left of the line each robot is, m. It steers for the point of the
+    line that is `LOOKAHEAD` away, and never comes in at more than 45 degrees, as on a route.
+    """
+    steepest = math.sin(math.pi / 4)
+    return torch.asin((beside / LOOKAHEAD).clamp(-steepest, steepest))
+
+
+def turn_rate(wanted: Tensor, yaw: Tensor, limit: float, gain: float = 3.0) -> Tensor:
+    """Return the turn rate (rad/s) that closes the yaw error the shorter way, within `limit`."""
+    error = torch.remainder(wanted - yaw + math.pi, 2 * math.pi) - math.pi
+    return (gain * error).clamp(-limit, limit)
