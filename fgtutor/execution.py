@@ -168,7 +168,6 @@ class _Drive:
             ]
         )
         n = len(routes)
-        self.idle = np.zeros(n, dtype=int)
         self.error = np.zeros((n, 2))
         self.active = np.array([track.policy for track in self.tracks])
         self.waiting = np.zeros(n, dtype=int)
@@ -212,7 +211,7 @@ class _Drive:
                         reason[i] = "fell"
                     elif away <= self.config.goal_radius:
                         reason[i] = "reached"
-                    elif step >= self.limits[i] or self.idle[i] >= stuck:
+                    elif step >= self.limits[i] or self.tracks[i].idle >= stuck:
                         reason[i] = "timeout"
                     bar.update(reason[i] is not None)
                 if None not in reason:
@@ -247,9 +246,7 @@ class _Drive:
             believed = pose[:, :2]
         aims = np.zeros(n)
         for i, track in enumerate(self.tracks):
-            before = track.nearest
             track.advance(believed[i])
-            self.idle[i] = self.idle[i] + 1 if track.nearest == before else 0
             aim = track.ahead(config.lookahead) - believed[i]
             aims[i] = math.atan2(aim[1], aim[0]) if np.hypot(*aim) > 1e-3 else pose[i, 3]
             self._choose(i, track.policy)
@@ -292,6 +289,7 @@ class _Track:
         self.policies = np.asarray(route.policies)[edge] if len(at) > 1 else np.zeros(1, dtype=int)
         self.yaw = math.atan2(*(xy[1] - xy[0])[::-1]) if len(at) > 1 else 0.0
         self.nearest = 0
+        self.idle = 0  # steps since it last came further
 
     @property
     def policy(self) -> int:
@@ -305,4 +303,6 @@ class _Track:
     def advance(self, place: np.ndarray, window: float = 1.0) -> None:
         """Move to the nearest point of the route within `window` metres ahead; never back."""
         reach = self.points[self.nearest : self.nearest + round(window / self.SPACING)]
-        self.nearest += int(np.argmin(((reach - place) ** 2).sum(axis=1)))
+        further = int(np.argmin(((reach - place) ** 2).sum(axis=1)))
+        self.nearest += further
+        self.idle = 0 if further else self.idle + 1

@@ -106,15 +106,15 @@ class TrainConfig:
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must be 0 or more, got {getattr(self, name)}")
 
-        start = self.start_from and self.start_from.resolve()
-        if start in (self.folder.resolve(), (self.folder / "specialist").resolve()):
+        own = (self.folder.resolve(), (self.folder / "specialist").resolve())
+        if self.start_from and self.start_from.resolve() in own:
             raise ConfigError(
                 f"{self.folder} would be overwritten by the run that starts from it: give another "
                 "--out, or go on with --resume and without --from"
             )
-        for name in ("easiest", "neighbours"):
+        for name, what in (("easiest", "difficulty"), ("neighbours", "share")):
             if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
+                raise ConfigError(f"{name} must be a {what} from 0 to 1, got {getattr(self, name)}")
 
     @property
     def folder(self) -> Path:

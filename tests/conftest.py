@@ -8,6 +8,8 @@ from pathlib import Path
 # Before anything imports matplotlib or GitPython: neither may look for a screen or for git.
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+# Nor may the kernels and the processes that tests start each take every core at once.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch

@@ -338,8 +338,10 @@ def test_rows_rise_from_the_easiest_difficulty_to_the_whole():
         [0.75] * 2,
         [1.0] * 2,
     ]
-    with pytest.raises(ConfigError, match="easiest must lie in"):
+    with pytest.raises(ConfigError, match=r"easiest must be a difficulty from 0 to 1, got 1\.5"):
         TrainConfig(easiest=1.5)
+    with pytest.raises(ConfigError, match=r"neighbours must be a share from 0 to 1, got -0\.1"):
+        TrainConfig(neighbours=-0.1)
 
 
 def test_a_share_of_the_terrains_has_neighbours_where_there_can_be_any():
