@@ -34,12 +34,13 @@ browser:
 	  echo "Chromium could not be installed: the browser test will be skipped"; \
 	else echo "no Chromium and not root: the browser test will be skipped"; fi
 
-# The server asks for its token and listens on the loopback address only.
-lab: $(ALL) notebooks/01_elevation_maps.ipynb
-	$(BIN)/jupyter lab --ip=127.0.0.1 notebooks/01_elevation_maps.ipynb
-
-notebooks/%.ipynb: notebooks/src/%.py | $(ALL)
-	$(BIN)/fgtutor notebooks --names $*
+# The server asks for its token and listens on the loopback address only. In a container one often
+# is root, which JupyterLab refuses unless told. It starts here, so that exercises/ is in sight.
+FIRST := /lab/tree/notebooks/01_elevation_maps.ipynb
+lab: $(ALL)
+	$(BIN)/jupyter lab --ip=127.0.0.1 $(if $(filter 0,$(shell id -u)),--allow-root) \
+	  --LabApp.default_url=$(FIRST) \
+	  --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate
 
 notebooks: $(ALL)
 	$(BIN)/fgtutor notebooks

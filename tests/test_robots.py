@@ -158,7 +158,23 @@ def test_between_neighbours_robots_stay_off_them(robot):
     poses = env.motion()[0].clone()
     poses[:4, 0] += torch.tensor([terrain.limits[k] + s for k in (0, 1) for s in (-0.01, 0.01)])
     poses[:4, 0] -= x[:4]
-    assert env._outside(poses).nonzero().flatten().tolist() == [0, 3]
+    outside, strange = env._outside(poses)
+    assert outside.nonzero().flatten().tolist() == strange.nonzero().flatten().tolist() == [0, 3]
+
+
+@robots
+def test_going_on_to_a_neighbours_obstacle_is_infeasible_but_no_fault(robot):
+    """Nobody knows what would happen there, so it must not look feasible; PPO sees a time-out."""
+    terrain = make_terrain("gaps", robot=robot, seed=3, neighbours=True)
+    assert terrain.limits is not None
+    env = env_class(robot)(World([[terrain]]), 2, config=EnvConfig(train=False))
+    last = torch.tensor([terrain.limits[1] + 0.02, 2.0, 0.0])
+    poses = torch.stack((last, last - torch.tensor([0.5, 0.0, 0.0])))
+    poses[:, :2] += env.tile_corner(torch.arange(2))
+    env.start(torch.arange(2), poses, 0.0)
+    observations, _, done, extras = env.step(torch.zeros(2, env.num_actions))
+    assert done.tolist() == [1, 0] and extras["time_outs"].tolist() == [1.0, 0.0]
+    assert observations["tracking"][:, 1].tolist() == [1.0, 0.0]
 
 
 @robots

@@ -40,7 +40,8 @@ class LocomotionEnv(VecEnv):
     """A batch of robots on a `World`, with observation groups {policy, patch, command, tracking}.
 
     The `tracking` group holds, for the step just taken, (r_v, failed, ended): r_v is 0 once a robot
-    has failed, so a fall can never look feasible. If asked for, `history` holds the last frames of
+    has failed, so a fall can never look feasible; nor can what is never tried: whoever goes on to
+    another's obstacle has failed there. If asked for, `history` holds the last frames of
     what a blind robot feels and `critic` all that the simulation knows: true velocity, then policy.
     """
 
@@ -177,9 +178,10 @@ class LocomotionEnv(VecEnv):
         r_v = tracking_reward(self.along_heading(pose, velocity), self.command[:, :2]) * ~failed
         reward = self.reward(r_v, failed)
         self.return_r_v += r_v
-        truncated = (self.episode_length_buf >= self.max_episode_length) | self._outside(pose)
+        outside, strange = self._outside(pose)
+        truncated = (self.episode_length_buf >= self.max_episode_length) | outside
         done = failed | truncated
-        self.tracking = torch.stack((r_v, failed.float(), done.float()), dim=-1)
+        self.tracking = torch.stack((r_v, (failed | strange).float(), done.float()), dim=-1)
         extras = {"time_outs": (truncated & ~failed).float(), "fell": fell}
         if self.config.train:
             ids = done.nonzero().flatten()
@@ -388,11 +390,13 @@ class LocomotionEnv(VecEnv):
         self.stuck_steps = torch.where(moved, 0, self.stuck_steps + 1)
         return self.stuck_steps * self.control_dt > self.config.stuck_seconds
 
-    def _outside(self, pose: Tensor) -> Bool[Tensor, "envs"]:
-        """Tell which robots have left their tile for its margin, or for a neighbour's obstacle."""
+    def _outside(self, pose: Tensor) -> tuple[Bool[Tensor, "envs"], Bool[Tensor, "envs"]]:
+        """Tell which robots have left their tile, and which of them for a neighbour's obstacle."""
         x, y = (pose[:, :2] - self.tile_corner(torch.arange(self.num_envs))).unbind(dim=-1)
         first, last = self.limits[self.row, self.column].unbind(-1)
-        return (x < first) | (x > last) | (y < 0.0) | (y > self.tile_size[1])
+        beyond = (x < first) | (x > last)
+        strange = beyond & (x > 0.0) & (x < self.tile_size[0])
+        return beyond | (y < 0.0) | (y > self.tile_size[1]), strange
 
     def tile_corner(self, ids: Tensor) -> Float[Tensor, "n 2"]:
         """Return the world position of the corner (0, 0) of each robot's present tile, m."""
