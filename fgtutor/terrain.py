@@ -173,9 +173,9 @@ def make_terrain(
     if neighbours:
         (_, x0, x1), (_, y) = plan[1], lane[0]
         landing = scale.mixed_landing
-        # Just out of the one neighbour, and to where no foot touches the other.
-        start, goal = (x0 - 0.75 * landing, y), (x1 + 0.75 * landing, y)
-        limits = (x0 - 0.85 * landing, x1 + 0.85 * landing)
+        # To where no foot touches a neighbour; from where none does at rest, askew or not.
+        start, goal = (x0 - 0.6 * landing, y), (x1 + 0.6 * landing, y)
+        limits = (x0 - 0.7 * landing, x1 + 0.7 * landing)
     return Terrain(
         name=name,
         robot=robot,

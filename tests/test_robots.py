@@ -163,6 +163,18 @@ def test_between_neighbours_robots_stay_off_them(robot):
 
 
 @robots
+def test_between_neighbours_crossings_begin_with_all_feet_on_the_landing(robot):
+    """Who is put down with a foot over a stranger's chasm has failed before it has done anything."""
+    row = [make_terrain("steps", robot=robot, seed=seed, neighbours=True) for seed in range(8)]
+    config = EnvConfig(train=False, start_yaw=0.8)
+    env = env_class(robot)(World([row]), 256, config=config)
+    crossing, fell = env.crossing.clone(), torch.zeros(256, dtype=torch.bool)
+    for _ in range(round(0.4 / env.control_dt)):
+        fell |= env.step(torch.zeros(256, env.num_actions))[3]["fell"]
+    assert not (fell & crossing).any()
+
+
+@robots
 def test_going_on_to_a_neighbours_obstacle_is_infeasible_but_no_fault(robot):
     """Nobody knows what would happen there, so it must not look feasible; PPO sees a time-out."""
     terrain = make_terrain("gaps", robot=robot, seed=3, neighbours=True)
