@@ -164,7 +164,7 @@ def test_between_neighbours_robots_stay_off_them(robot):
 
 @robots
 def test_between_neighbours_crossings_begin_with_all_feet_on_the_landing(robot):
-    """Who is put down with a foot over a stranger's chasm has failed before it has done anything."""
+    """Who is put down with a foot over a stranger's chasm has failed before doing anything."""
     row = [make_terrain("steps", robot=robot, seed=seed, neighbours=True) for seed in range(8)]
     config = EnvConfig(train=False, start_yaw=0.8)
     env = env_class(robot)(World([row]), 256, config=config)
