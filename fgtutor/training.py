@@ -98,10 +98,12 @@ class Trainer:
     def _start_from(self, folder: Path) -> None:
         """Take over a trained policy, all but its action noise; the Feasibility-Net stays new.
 
-        From a run's folder its critic comes along; otherwise the new one learns first, alone.
+        From a run's folder, finished or not, its critic comes along; otherwise the new one learns
+        first, alone.
         """
         checkpoint = folder / CHECKPOINT
-        specialist = load_specialist(folder / "specialist" if checkpoint.exists() else folder)
+        run = _read(checkpoint) if checkpoint.exists() else None
+        specialist = load_specialist(folder / f"snapshots/{run['iteration']}" if run else folder)
         mine, start = self.algorithm.get_policy(), specialist.policy
         if specialist.robot != self.config.robot or start.obs_dim != mine.obs_dim:
             raise CheckpointError(
@@ -112,10 +114,8 @@ class Trainer:
         self.samples_before = int(specialist.provenance.get("samples", 0))
         noise = {k: v for k, v in mine.state_dict().items() if k.startswith("distribution")}
         mine.load_state_dict(start.state_dict() | noise)
-        if checkpoint.exists():
-            self.algorithm.critic.load_state_dict(
-                _read(checkpoint)["algorithm"]["critic_state_dict"]
-            )
+        if run:
+            self.algorithm.critic.load_state_dict(run["algorithm"]["critic_state_dict"])
         else:
             self.critic_warmup = self.config.critic_warmup
 

@@ -2,6 +2,7 @@ import dataclasses
 import json
 import os
 import signal
+import shutil
 import subprocess
 import sys
 import time
@@ -205,7 +206,9 @@ def test_a_run_starts_from_a_trained_policy_with_a_critic_of_its_own(trained, tm
 
 def test_from_a_run_its_critic_comes_along_and_nothing_warms_up(trained, tmp_path):
     config, specialist, _ = trained
-    settings = TINY | {"iterations": 3, "start_from": config.folder, "easiest": 0.5}
+    killed = shutil.copytree(config.folder, tmp_path / "killed")
+    shutil.rmtree(killed / "specialist")  # which a run writes when it ends
+    settings = TINY | {"iterations": 3, "start_from": killed, "easiest": 0.5}
     trainer = Trainer(TrainConfig(out=tmp_path / "run", **settings))
     critic = torch.load(config.folder / "checkpoint.pt")["algorithm"]["critic_state_dict"]
     policy, mine = trainer.algorithm.get_policy(), trainer.algorithm.critic.state_dict()
