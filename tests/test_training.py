@@ -1,8 +1,8 @@
 import dataclasses
 import json
 import os
-import signal
 import shutil
+import signal
 import subprocess
 import sys
 import time
