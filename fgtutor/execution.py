@@ -176,7 +176,8 @@ class _Drive:
         starts = [
             (
                 *(track.points[0] + corner + config.start_noise * dice.standard_normal(2)),
-                track.yaw + config.start_yaw_noise * dice.standard_normal(),
+                track.bearing(track.points[0], config.lookahead)
+                + config.start_yaw_noise * dice.standard_normal(),
             )
             for track, corner, dice in zip(self.tracks, self.corners, self.dice, strict=True)
         ]
@@ -247,8 +248,7 @@ class _Drive:
         aims = np.zeros(n)
         for i, track in enumerate(self.tracks):
             track.advance(believed[i])
-            aim = track.ahead(config.lookahead) - believed[i]
-            aims[i] = math.atan2(aim[1], aim[0]) if np.hypot(*aim) > 1e-3 else pose[i, 3]
+            aims[i] = track.bearing(believed[i], config.lookahead, pose[i, 3])
             self._choose(i, track.policy)
         yaw = torch.as_tensor(pose[:, 3], dtype=torch.float32)
         turn = turn_rate(
@@ -287,7 +287,6 @@ class _Track:
         edge = np.clip(np.searchsorted(at, distance, "right") - 1, 0, max(len(at) - 2, 0))
         self.points = np.stack([np.interp(distance, at, xy[:, axis]) for axis in (0, 1)], axis=-1)
         self.policies = np.asarray(route.policies)[edge] if len(at) > 1 else np.zeros(1, dtype=int)
-        self.yaw = math.atan2(*(xy[1] - xy[0])[::-1]) if len(at) > 1 else 0.0
         self.nearest = 0
         self.idle = 0  # steps since it last came further
 
@@ -296,9 +295,13 @@ class _Track:
         """The policy that the route names where the robot is."""
         return int(self.policies[self.nearest])
 
-    def ahead(self, distance: float) -> np.ndarray:
-        """Return the point `distance` metres further along; the end of the route beyond it."""
-        return self.points[min(self.nearest + round(distance / self.SPACING), len(self.points) - 1)]
+    def bearing(self, place: np.ndarray, distance: float, there: float = 0.0) -> float:
+        """Return the direction to the point `distance` metres further along, or to the end, rad.
+
+        `there` is the answer for who stands on that point.
+        """
+        aim = self.points[: self.nearest + round(distance / self.SPACING) + 1][-1] - place
+        return math.atan2(aim[1], aim[0]) if np.hypot(*aim) > 1e-3 else there
 
     def advance(self, place: np.ndarray, window: float = 1.0) -> None:
         """Move to the nearest point of the route within `window` metres ahead; never back."""

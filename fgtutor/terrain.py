@@ -80,10 +80,20 @@ class Terrain:
     @property
     def spread(self) -> float:
         """How far beside the lane a robot may walk, m."""
-        x0, x1 = self.limits or (0.0, self.elevation.size[0])
         anywhere = 0.3 * self.elevation.size[1]
-        own = [part.name for part in self.sections if x0 <= part.x0 and part.x1 <= x1]
-        return min((SPREAD.get(name, anywhere) for name in own), default=anywhere)
+        return min((SPREAD.get(part.name, anywhere) for part in self._own), default=anywhere)
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Between which x its obstacles lie, m; from start to goal where there is none."""
+        edges = [x for part in self._own for x in (part.x0, part.x1)]
+        return min(edges, default=self.start[0]), max(edges, default=self.goal[0])
+
+    @property
+    def _own(self) -> list[Section]:
+        """Its sections without the neighbours'."""
+        x0, x1 = self.limits or (0.0, self.elevation.size[0])
+        return [part for part in self.sections if x0 <= part.x0 and part.x1 <= x1]
 
     @classmethod
     def from_elevation(

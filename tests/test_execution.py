@@ -52,6 +52,21 @@ def test_it_follows_bends(make_rolling, goal):
     assert away.max() < 0.45, "it stays near the route"
 
 
+def test_it_starts_towards_where_it_will_steer_not_along_the_first_cell(make_rolling):
+    # 0.2 m aside in 3 m: two cells of the route are diagonal, wherever the search puts them.
+    elevation, ends = flat(), ((1.05, 2.05), (4.05, 2.25))
+    route = straight(elevation, *ends)
+    cells = route.cells.copy()
+    cells[1:3] = cells[0] + np.array([[1, 1], [2, 2]])
+    cells[3:, 1] = cells[2, 1]
+    x, y = elevation.centres
+    route = replace(route, cells=cells, xy=np.stack((x[cells[:, 0]], y[cells[:, 1]]), axis=-1))
+    terrain, sure = Terrain.from_elevation(elevation, *ends), FollowConfig(start_yaw_noise=0)
+    episode = execute(route, terrain, {"roll": make_rolling()}, config=sure)
+    assert episode.success
+    assert episode.poses[0, 3] == pytest.approx(math.atan2(0.2, 0.37), abs=0.1)
+
+
 def test_a_ledge_is_a_time_out_and_a_gap_is_a_fall(make_rolling):
     ledge, gap = np.zeros((60, 40)), np.zeros((60, 40))
     ledge[30:], gap[30:34] = 0.2, -1.0

@@ -175,6 +175,21 @@ def test_between_neighbours_crossings_begin_with_all_feet_on_the_landing(robot):
 
 
 @robots
+def test_crossings_begin_anywhere_up_to_their_run_up(robot):
+    terrain = make_terrain("bridge", robot=robot, seed=3)
+    env = env_class(robot)(World([[terrain]]), 512, config=EnvConfig(run_up=0.6))
+    x = (env.motion()[0][:, 0] - env.tile_corner(torch.arange(512))[:, 0])[env.crossing]
+    forwards = torch.cos(env.target_yaw[env.crossing]) > 0
+    for side, last in (
+        (x[forwards], terrain.span[0] - 0.6),
+        (-x[~forwards], -terrain.span[1] - 0.6),
+    ):
+        first = terrain.start[0] if last > 0 else -terrain.goal[0]
+        assert first - 1e-4 <= side.min() < first + 0.1 * (last - first)
+        assert last + 1e-4 >= side.max() > last - 0.1 * (last - first)
+
+
+@robots
 def test_going_on_to_a_neighbours_obstacle_is_infeasible_but_no_fault(robot):
     """Nobody knows what would happen there, so it must not look feasible; PPO sees a time-out."""
     terrain = make_terrain("gaps", robot=robot, seed=3, neighbours=True)

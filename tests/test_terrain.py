@@ -182,6 +182,7 @@ def test_neighbours_are_other_obstacles_a_landing_away(robot: str, seed: int) ->
         assert terrain.elevation.shape == alone.elevation.shape, "they share a World"
         assert terrain.spread == alone.spread, "the neighbours do not narrow the way"
         before, own, after = terrain.sections
+        assert terrain.span == (own.x0, own.x1)
         assert own.name == name and name not in (before.name, after.name)
         assert (before.x0, after.x1) == (0.0, terrain.elevation.size[0])
         for left, right in ((before, own), (own, after)):

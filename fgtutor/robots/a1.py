@@ -69,6 +69,7 @@ A1_EPISODES = EnvConfig(
     stuck_seconds=2.5,
     obedience=0.8,
     start_yaw=0.8,
+    run_up=0.6,
     promote_above=0.4,
     demote_below=0.15,
 )

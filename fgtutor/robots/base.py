@@ -280,10 +280,13 @@ class LocomotionEnv(VecEnv):
         whole = (0.0, float(self.tile_size[0]))
         limits = np.array([[tile.limits or whole for tile in row] for row in tiles])
         ends = np.array([[(tile.start[0], tile.goal[0]) for tile in row] for row in tiles])
+        far = self.config.run_up * np.array([-1.0, 1.0])
+        near = np.array([[tile.span for tile in row] for row in tiles]) + far
+        near = np.clip(near, ends.min(-1, keepdims=True), ends.max(-1, keepdims=True))
         self.lanes = torch.as_tensor(lanes, dtype=torch.float32, device=self.device)
-        self.spreads, self.limits, self.ends = (
+        self.spreads, self.limits, self.ends, self.near = (
             torch.as_tensor(table, dtype=torch.float32, device=self.device)
-            for table in (spreads, limits, ends)
+            for table in (spreads, limits, ends, near)
         )
 
     def _lane(self, ids: Tensor, x: Tensor) -> Tensor:
@@ -300,8 +303,10 @@ class LocomotionEnv(VecEnv):
         first, last = self.limits[row, column].unbind(-1)
         width = self.tile_size[1]
         backwards = self._uniform(n) < 0.3
-        start, goal = self.ends[row, column].unbind(-1)
-        x = torch.where(backwards, goal, start)
+        side = backwards.long()
+        x = self.ends[row, column, side]
+        if math.isfinite(self.config.run_up):
+            x = x + self._uniform(n) * (self.near[row, column, side] - x)
         # Near enough to the lane to reach it before the obstacle begins.
         beside = (self.spreads[row, column] + 0.3).clamp(max=0.3 * width)
         beside = beside * (2 * self._uniform(n) - 1)

@@ -47,6 +47,9 @@ class EnvConfig:
     """Share of the greatest turn rate at which a robot is expected to follow a new heading."""
     start_yaw: float = 0.15
     """Greatest angle at which a crossing comes to its lane, rad; routes do at 45 degrees."""
+    run_up: float = math.inf
+    """Least distance before the obstacle at which a crossing begins, m, since a route may bend as
+    late; infinite: all begin at the tile's end."""
     traverse_share: float = 0.6
     """Share of episodes that start at a tile's end and cross it; the others start anywhere."""
     turn_share: float = 0.25
