@@ -43,7 +43,7 @@ STEEPNESS = 25.0
 """How far down the camera looks, degrees."""
 HARDLY = 1e-9
 """As good as no lower limit on feasibility: f is a sigmoid, and never quite 0."""
-DOTS = 5_000
+DOTS = 3_000
 """Points of a cloud that are drawn at most: more would only cover each other."""
 PAGE = 840
 """Widest film strip, pixels: a notebook is no wider, and must stay small."""
