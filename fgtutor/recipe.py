@@ -37,7 +37,8 @@ class TrainConfig:
     """Continue from the run folder's checkpoint."""
     start_from: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Specialist folder whose policy to start from, such as a walker's, or a run's folder, whose
-    critic then comes along (to go on with the same terrain made harder); default: from nothing."""
+    critic and, on the same terrain, Feasibility-Net come along (to go on where it is harder);
+    default: from nothing."""
     actor: Literal["perceptive", "dreamwaq"] = "perceptive"
     """What the policy observes: its body and a scan of the ground, or, blind, a few steps' history
     from which it imagines the ground (the paper's protocol)."""

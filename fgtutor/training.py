@@ -96,10 +96,10 @@ class Trainer:
         return make_training_env(replace(self.config, seed=seed, device="cpu"), self.iteration)
 
     def _start_from(self, folder: Path) -> None:
-        """Take over a trained policy, all but its action noise; the Feasibility-Net stays new.
+        """Take over a trained policy, all but its action noise.
 
-        From a run's folder, finished or not, its critic comes along; otherwise the new one learns
-        first, alone.
+        From a run's folder, finished or not, its critic comes along, and on the same terrain its
+        Feasibility-Net; otherwise these are new, and the critic learns first, alone.
         """
         checkpoint = folder / CHECKPOINT
         run = _read(checkpoint) if checkpoint.exists() else None
@@ -116,6 +116,8 @@ class Trainer:
         mine.load_state_dict(start.state_dict() | noise)
         if run:
             self.algorithm.critic.load_state_dict(run["algorithm"]["critic_state_dict"])
+            if specialist.name == self.config.terrain:
+                self.algorithm.feasibility.load_state_dict(specialist.feasibility.state_dict())
         else:
             self.critic_warmup = self.config.critic_warmup
 

@@ -204,7 +204,7 @@ def test_a_run_starts_from_a_trained_policy_with_a_critic_of_its_own(trained, tm
     assert row["samples"] == specialist.provenance["samples"] + 3 * 4 * 8
 
 
-def test_from_a_run_its_critic_comes_along_and_nothing_warms_up(trained, tmp_path):
+def test_from_a_run_its_critic_and_net_come_along_and_nothing_warms_up(trained, tmp_path):
     config, specialist, _ = trained
     killed = shutil.copytree(config.folder, tmp_path / "killed")
     shutil.rmtree(killed / "specialist")  # which a run writes when it ends
@@ -213,6 +213,11 @@ def test_from_a_run_its_critic_comes_along_and_nothing_warms_up(trained, tmp_pat
     critic = torch.load(config.folder / "checkpoint.pt")["algorithm"]["critic_state_dict"]
     policy, mine = trainer.algorithm.get_policy(), trainer.algorithm.critic.state_dict()
     assert critic and all(torch.equal(value, mine[name]) for name, value in critic.items())
+    net, theirs = trainer.algorithm.feasibility.state_dict(), specialist.feasibility.state_dict()
+    assert all(torch.equal(value.cpu(), net[name]) for name, value in theirs.items())
+    other = Trainer(TrainConfig(out=tmp_path / "other", **settings | {"terrain": "rubble"}))
+    net = other.algorithm.feasibility.state_dict()
+    assert any(not torch.equal(value.cpu(), net[name]) for name, value in theirs.items())
     first = {k: v.clone() for k, v in policy.state_dict().items() if "distribution" not in k}
     assert all(torch.equal(v, specialist.policy.state_dict()[k].cpu()) for k, v in first.items())
     trainer.iterate()
