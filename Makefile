@@ -36,10 +36,9 @@ browser:
 
 # The server asks for its token and listens on the loopback address only. In a container one often
 # is root, which JupyterLab refuses unless told. It starts here, so that exercises/ is in sight.
-FIRST := /lab/tree/notebooks/01_elevation_maps.ipynb
 lab: $(ALL)
 	$(BIN)/jupyter lab --ip=127.0.0.1 $(if $(filter 0,$(shell id -u)),--allow-root) \
-	  --LabApp.default_url=$(FIRST) \
+	  --LabApp.default_url=/lab/tree/notebooks/01_elevation_maps.ipynb \
 	  --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate
 
 notebooks: $(ALL)

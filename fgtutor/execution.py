@@ -300,7 +300,8 @@ class _Track:
 
         `there` is the answer for who stands on that point.
         """
-        aim = self.points[: self.nearest + round(distance / self.SPACING) + 1][-1] - place
+        ahead = min(self.nearest + round(distance / self.SPACING), len(self.points) - 1)
+        aim = self.points[ahead] - place
         return math.atan2(aim[1], aim[0]) if np.hypot(*aim) > 1e-3 else there
 
     def advance(self, place: np.ndarray, window: float = 1.0) -> None:

@@ -270,7 +270,7 @@ class LocomotionEnv(VecEnv):
         return torch.rand(*shape, generator=self.random).to(self.device)
 
     def _lay_lanes(self) -> None:
-        """Tabulate each tile's ends, and where at every 0.1 m along it its lane lies."""
+        """Tabulate where on each tile crossings begin, and at every 0.1 m where its lane lies."""
         x = np.arange(0.0, float(self.tile_size[0]) + 0.1, 0.1)
         tiles = self.world.tiles
         lanes = np.array(
@@ -296,7 +296,7 @@ class LocomotionEnv(VecEnv):
         return self.lanes[row, column, along.clamp(0, self.lanes.shape[-1] - 1)]
 
     def _draw_poses(self, ids: Tensor) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-        """Draw poses: across the tile from one of its ends, or anywhere the ground is level."""
+        """Draw poses: before the obstacle to cross it, or anywhere the ground is level."""
         n, tries = len(ids), 8
         corner = self.tile_corner(ids)
         row, column = self.row[ids], self.column[ids]

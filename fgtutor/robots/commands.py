@@ -51,7 +51,7 @@ class EnvConfig:
     """Least distance before the obstacle at which a crossing begins, m, since a route may bend as
     late; infinite: all begin at the tile's end."""
     traverse_share: float = 0.6
-    """Share of episodes that start at a tile's end and cross it; the others start anywhere."""
+    """Share of episodes that start before the obstacle and cross it; others start anywhere."""
     turn_share: float = 0.25
     """Share of episodes whose heading changes on the way, as a route's does."""
     promote_above: float = 0.5
