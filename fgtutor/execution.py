@@ -20,7 +20,7 @@ from fgtutor.errors import ConfigError
 from fgtutor.planning import Route
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.robots.commands import LOOKAHEAD, turn_rate
+from fgtutor.robots.commands import LOOKAHEAD
 from fgtutor.specialist import Specialist
 from fgtutor.terrain import Terrain, World
 
@@ -250,12 +250,7 @@ class _Drive:
             track.advance(believed[i])
             aims[i] = track.bearing(believed[i], config.lookahead, pose[i, 3])
             self._choose(i, track.policy)
-        yaw = torch.as_tensor(pose[:, 3], dtype=torch.float32)
-        turn = turn_rate(
-            torch.as_tensor(aims, dtype=torch.float32), yaw, self.env.config.max_turn_rate
-        )
-        self.env.command[:, 0] = self.speed
-        self.env.command[:, 2] = turn.to(self.env.command)
+        self.env.steer(torch.as_tensor(aims).to(self.env.command))
 
     def _choose(self, i: int, wanted: int) -> None:
         """Switch robot i's policy once another has been wanted for long enough."""

@@ -89,8 +89,24 @@ def test_a_new_heading_must_be_followed_at_some_rate():
     while not env._strayed(stays).any():
         env._steer()
         steps += 1
-    # 45 degrees at 0.8 times 1 rad/s.
-    assert steps * env.control_dt == pytest.approx(math.radians(45) / 0.8, abs=0.05)
+    # 45 degrees at 0.5 times 1 rad/s.
+    assert steps * env.control_dt == pytest.approx(math.radians(45) / 0.5, abs=0.05)
+
+
+def test_who_turns_faster_than_expected_has_not_strayed():
+    env = make(n=2, config=dataclasses.replace(A1_EPISODES, train=True, turn_share=0.0))
+    put(env, (4.0, 2.0, 0.0), (4.0, 2.0, 0.0))
+    env.turning[:], env.crossing[:] = False, False
+    env.target_yaw += math.pi / 2
+    env._steer()
+    # Nearly there at once; the other turned away as far.
+    env.pose[:, 3] = torch.tensor([1.2, -1.2])
+    env._steer()
+    assert env._strayed(env.pose).tolist() == [False, True]
+    assert env.told_yaw.tolist() == pytest.approx([1.2, 0.02], abs=0.01)
+    env.pose[:, 3] = math.pi / 2 + 0.3  # beyond the heading wanted: that is not further
+    env._steer()
+    assert env.told_yaw[0].item() == pytest.approx(1.21, abs=0.01)
 
 
 def test_velocity_counts_along_the_heading_told():

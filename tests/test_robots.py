@@ -9,7 +9,7 @@ from fgtutor import patches
 from fgtutor.errors import ConfigError
 from fgtutor.patches import sample_patches
 from fgtutor.robots import ROBOTS, env_class
-from fgtutor.robots.commands import EnvConfig, tracking_reward, turn_rate
+from fgtutor.robots.commands import EnvConfig, slowdown, tracking_reward, turn_rate
 from fgtutor.terrain import World, make_terrain
 
 robots = pytest.mark.parametrize("robot", sorted(ROBOTS))
@@ -39,6 +39,25 @@ def test_turn_rate_takes_the_shorter_way_within_the_limit():
     wanted = torch.tensor([math.pi - 0.1, 0.2, 3.0])
     yaw = torch.tensor([-math.pi + 0.1, 0.1, 0.0])
     assert turn_rate(wanted, yaw, 1.5).tolist() == pytest.approx([-0.6, 0.3, 1.5], abs=1e-5)
+
+
+def test_who_must_turn_far_slows_down_by_the_cosine_squared():
+    wanted = torch.tensor([0.5, 0.5 + math.pi / 4, 0.5 - math.pi / 2, 0.5 + math.pi])
+    yaw = torch.tensor([0.5, 0.5, 0.5, 0.5 + 4 * math.pi])
+    assert slowdown(wanted, yaw, 0.25).tolist() == pytest.approx([1.0, 0.5, 0.25, 0.25], abs=1e-5)
+    assert slowdown(wanted, yaw, 1.0).tolist() == [1.0] * 4
+
+
+@robots
+@pytest.mark.parametrize("slowest", [1.0, 0.25])
+def test_a_robot_is_steered_at_its_speed_straight_on_and_slower_in_a_turn(robot, slowest):
+    env = make_env(robot, slowest=slowest)
+    yaw = torch.tensor([0.0, 0.3, 1.0, -2.0])
+    env.start(torch.arange(4), torch.stack((torch.full((4,), 1.0),) * 2 + (yaw,), dim=-1), 0.8)
+    env.steer(torch.zeros(4))
+    share = [max(slowest, max(0.0, math.cos(angle)) ** 2) for angle in yaw.tolist()]
+    assert env.command[:, 0].tolist() == pytest.approx([0.8 * s for s in share], abs=1e-3)
+    assert env.command[:, 2].sign().tolist() == [0.0, -1.0, -1.0, 1.0]
 
 
 @robots

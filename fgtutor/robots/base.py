@@ -22,7 +22,15 @@ from fgtutor import patches
 from fgtutor.dreamwaq import VELOCITY, History
 from fgtutor.errors import ConfigError
 from fgtutor.patches import PatchGrid, sample_patches
-from fgtutor.robots.commands import LOOKAHEAD, EnvConfig, bearing, tracking_reward, turn_rate
+from fgtutor.robots.commands import (
+    LOOKAHEAD,
+    EnvConfig,
+    bearing,
+    off_by,
+    slowdown,
+    tracking_reward,
+    turn_rate,
+)
 from fgtutor.symmetry import Mirror
 from fgtutor.terrain import World
 
@@ -88,6 +96,7 @@ class LocomotionEnv(VecEnv):
         self.row = torch.zeros(num_envs, dtype=torch.long)
         self.column = torch.arange(num_envs) % self.num_columns
         self.command = torch.zeros(num_envs, 3, device=device)
+        self.cruise = torch.zeros(num_envs, device=device)
         self.target_yaw = torch.zeros(num_envs, device=device)
         self.told_yaw = torch.zeros(num_envs, device=device)
         self.anchor = torch.zeros(num_envs, 2, device=device)
@@ -237,6 +246,7 @@ class LocomotionEnv(VecEnv):
         self.turning[ids] = False
         self.command[ids] = 0.0
         self.command[ids, 0] = speed
+        self.cruise[ids] = speed
 
     def patches(self) -> Float[Tensor, "envs points"]:
         """Return the height patch H_xy under every robot, looking along its yaw."""
@@ -308,7 +318,7 @@ class LocomotionEnv(VecEnv):
         if math.isfinite(self.config.run_up):
             x = x + self._uniform(n) * (self.near[row, column, side] - x)
         # Near enough to the lane to reach it before the obstacle begins.
-        beside = (self.spreads[row, column] + 0.3).clamp(max=0.3 * width)
+        beside = (self.spreads[row, column] + self.config.start_beside).clamp(max=0.3 * width)
         beside = beside * (2 * self._uniform(n) - 1)
         y = self._lane(ids, corner[:, 0] + x) + beside
         yaw = torch.where(backwards, torch.full((n,), math.pi), torch.zeros(n))
@@ -328,10 +338,11 @@ class LocomotionEnv(VecEnv):
         level = anywhere[torch.arange(n), best]
         crossing = self._uniform(n) < self.config.traverse_share
         poses = torch.where(crossing[:, None], across, level)
-        # Askew towards the lane, as a route comes to it; a little to either side elsewhere.
+        # Askew towards the lane, as a route comes to it, and rather more than less, since who fails
+        # to turn leaves few samples; a little to either side elsewhere.
         slight, share = 0.15, self._uniform(n)
         to_lane = -torch.sign(beside * torch.cos(poses[:, 2]))
-        askew = to_lane * ((self.config.start_yaw + slight) * share - slight)
+        askew = to_lane * ((self.config.start_yaw + slight) * share.sqrt() - slight)
         poses[:, 2] += torch.where(crossing, askew, slight * (2 * share - 1))
         return poses, crossing
 
@@ -352,9 +363,19 @@ class LocomotionEnv(VecEnv):
             beside = forth * self._beside_lane(pose, LOOKAHEAD * forth)
             ahead = torch.where(forth > 0, 0.0, math.pi)
             wanted = torch.where(self.crossing, ahead - bearing(beside), wanted)
-        self.command[:, 2] = turn_rate(wanted, pose[:, 3], self.config.max_turn_rate)
+        self.steer(wanted)
         expected = self.config.obedience * self.config.max_turn_rate
         self.told_yaw += self.control_dt * turn_rate(wanted, self.told_yaw, expected)
+        # Nobody is expected to wait for it: it never lags behind who has turned further.
+        to_go, left = off_by(wanted, self.told_yaw), off_by(wanted, pose[:, 3])
+        further = (to_go * left > 0) & (left.abs() < to_go.abs())
+        self.told_yaw = torch.where(further, pose[:, 3], self.told_yaw)
+
+    def steer(self, wanted: Float[Tensor, "envs"]) -> None:
+        """Command the turn rate, and the speed meanwhile, that bring each robot to a heading."""
+        yaw, config = self.motion()[0][:, 3], self.config
+        self.command[:, 0] = self.cruise * slowdown(wanted, yaw, config.slowest)
+        self.command[:, 2] = turn_rate(wanted, yaw, config.max_turn_rate)
 
     def _beside_line(self, pose: Tensor) -> Float[Tensor, "envs"]:
         """Return how far to the left of the straight line from its anchor each robot is, m."""

@@ -43,10 +43,14 @@ class EnvConfig:
     stray: float = 1.0
     """In training a robot this far beside its line has failed, m, and so has one that heads more
     than 45 degrees off the heading that it was told."""
+    slowest: float = 1.0
+    """Least share of its speed at which a robot turns; 1: it never slows down to turn."""
     obedience: float = 1.0
     """Share of the greatest turn rate at which a robot is expected to follow a new heading."""
     start_yaw: float = 0.15
     """Greatest angle at which a crossing comes to its lane, rad; routes do at 45 degrees."""
+    start_beside: float = 0.3
+    """Greatest distance beside the corridor over the obstacle at which a crossing begins, m."""
     run_up: float = math.inf
     """Least distance before the obstacle at which a crossing begins, m, since a route may bend as
     late; infinite: all begin at the tile's end."""
@@ -75,7 +79,20 @@ def bearing(beside: Float[Tensor, "envs"]) -> Float[Tensor, "envs"]:
     return torch.asin((beside / LOOKAHEAD).clamp(-steepest, steepest))
 
 
+def off_by(wanted: Tensor, yaw: Tensor) -> Tensor:
+    """Return the angle from `yaw` to `wanted` the shorter way, rad in [-pi, pi)."""
+    return torch.remainder(wanted - yaw + math.pi, 2 * math.pi) - math.pi
+
+
+def slowdown(wanted: Tensor, yaw: Tensor, slowest: float) -> Tensor:
+    """Return the share of its speed at which a robot should turn to the heading wanted.
+
+    It falls with the square of the yaw error's cosine, to `slowest` from 90 degrees on: without it,
+    no bend is tighter than speed / greatest turn rate.
+    """
+    return torch.cos(wanted - yaw).clamp(min=0.0).square().clamp(min=slowest)
+
+
 def turn_rate(wanted: Tensor, yaw: Tensor, limit: float, gain: float = 3.0) -> Tensor:
     """Return the turn rate (rad/s) that closes the yaw error the shorter way, within `limit`."""
-    error = torch.remainder(wanted - yaw + math.pi, 2 * math.pi) - math.pi
-    return (gain * error).clamp(-limit, limit)
+    return (gain * off_by(wanted, yaw)).clamp(-limit, limit)
