@@ -1,5 +1,5 @@
 # Every target installs what it needs into .venv first; nothing outside this folder is touched.
-#   make demo       plan and drive a mixed terrain with the shipped toy specialists; writes demo/
+#   make demo       plan and drive a mixed terrain with the shipped A1 specialists; writes demo/
 #   make test       every test          make test-fast  those that take under a minute together
 #   make lab        JupyterLab on the first notebook, on this machine only
 #   make notebooks  execute the notebooks' sources     make exercises  build them from their masters

@@ -1,16 +1,14 @@
 """The whole idea in two minutes: plan over a mixed terrain with the specialists, and drive it.
 
-Reads the shipped zoo and a terrain with several ways across; writes plan.png, route.json, a film of
-the drive and a film strip into a folder, and says what each shows. Source: paper, Sec. III, start
-to end.
+Reads the shipped zoo and a terrain; writes plan.png, route.json, a film of the drive and a film
+strip into a folder, and says what each shows. Source: paper, Sec. III, start to end.
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 
 from fgtutor.elevation import ElevationMap
@@ -24,15 +22,14 @@ from fgtutor.teach.videos import film_strip, save_video
 from fgtutor.tensorization import assess_all, resolve_taus, steps_on_known
 from fgtutor.terrain import Terrain, make_terrain
 
-ROBOT = "toy"
+ROBOT = "a1"
 """The robot that the demo shows unless told otherwise."""
 MAP = Path(__file__).parent / "zoo" / "maps" / "toy_mixed.npz"
 """The toy's: four ways round a ridge; benchmarks/make_demo_map.py composes it."""
 START, GOAL = (1.0, 4.0), (11.0, 4.0)
 """On either side of the ridge, m."""
-COURSES = (1, 49)
-"""The A1's: two mixed terrains side by side, by seed. These have the four obstacles in different
-orders and share all landings between them, so that there are sixteen ways across."""
+COURSE = 1
+"""The A1's: the seed of a mixed terrain, all four obstacles in a row from wall to wall."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,21 +99,5 @@ def toy_terrain() -> Terrain:
 
 
 def a1_terrain() -> Terrain:
-    """Return the A1's terrain: two mixed courses side by side, from and to the line between them.
-
-    Courses of one robot all have the same size. Each has all four obstacles in its own order, with
-    flat ground between two of them, where a route may change sides.
-    """
-    right, left = (make_terrain("mixed", robot="a1", seed=seed) for seed in COURSES)
-    width = right.elevation.size[1]
-    heights = np.concatenate((right.elevation.heights, left.elevation.heights), axis=1)
-    start, goal = ((x, width) for x, _ in (right.start, right.goal))
-    return replace(
-        right,
-        elevation=ElevationMap(heights, resolution=right.elevation.resolution),
-        boxes=(*right.boxes, *(box.shifted(0.0, width) for box in left.boxes)),
-        start=start,
-        goal=goal,
-        sections=(),
-        lane=(start, goal),
-    )
+    """Return the A1's terrain."""
+    return make_terrain("mixed", robot="a1", seed=COURSE)
