@@ -163,12 +163,12 @@ def route_at(switch_cost):
         return daring_route(view, terrain.start, terrain.goal, switch_cost=switch_cost)
 
 
-free, priced = route_at(0.0), route_at(2.0)
+free, priced = route_at(0.0), route_at(1.0)
 
 # %%
 from fgtutor.teach.lessons import compare_routes
 
-compare_routes(M, {"switching is free (the paper)": free, "a switch costs 2": priced})
+compare_routes(M, {"switching is free (the paper)": free, "a switch costs 1": priced})
 
 # %% [markdown]
 # *What to see:* count the switches. In the paper switching costs nothing, and its authors name that
