@@ -250,7 +250,8 @@ class _Drive:
             track.advance(believed[i])
             aims[i] = track.bearing(believed[i], config.lookahead, pose[i, 3])
             self._choose(i, track.policy)
-        self.env.steer(torch.as_tensor(aims).to(self.env.command))
+        wanted, yaw = torch.as_tensor(np.stack((aims, pose[:, 3]))).to(self.env.command)
+        self.env.steer(wanted, yaw)
 
     def _choose(self, i: int, wanted: int) -> None:
         """Switch robot i's policy once another has been wanted for long enough."""

@@ -54,7 +54,7 @@ def test_a_robot_is_steered_at_its_speed_straight_on_and_slower_in_a_turn(robot,
     env = make_env(robot, slowest=slowest)
     yaw = torch.tensor([0.0, 0.3, 1.0, -2.0])
     env.start(torch.arange(4), torch.stack((torch.full((4,), 1.0),) * 2 + (yaw,), dim=-1), 0.8)
-    env.steer(torch.zeros(4))
+    env.steer(torch.zeros(4), env.motion()[0][:, 3])
     share = [max(slowest, max(0.0, math.cos(angle)) ** 2) for angle in yaw.tolist()]
     assert env.command[:, 0].tolist() == pytest.approx([0.8 * s for s in share], abs=1e-3)
     assert env.command[:, 2].sign().tolist() == [0.0, -1.0, -1.0, 1.0]

@@ -363,7 +363,7 @@ class LocomotionEnv(VecEnv):
             beside = forth * self._beside_lane(pose, LOOKAHEAD * forth)
             ahead = torch.where(forth > 0, 0.0, math.pi)
             wanted = torch.where(self.crossing, ahead - bearing(beside), wanted)
-        self.steer(wanted)
+        self.steer(wanted, pose[:, 3])
         expected = self.config.obedience * self.config.max_turn_rate
         self.told_yaw += self.control_dt * turn_rate(wanted, self.told_yaw, expected)
         # Nobody is expected to wait for it: it never lags behind who has turned further.
@@ -371,11 +371,10 @@ class LocomotionEnv(VecEnv):
         further = (to_go * left > 0) & (left.abs() < to_go.abs())
         self.told_yaw = torch.where(further, pose[:, 3], self.told_yaw)
 
-    def steer(self, wanted: Float[Tensor, "envs"]) -> None:
+    def steer(self, wanted: Float[Tensor, "envs"], yaw: Float[Tensor, "envs"]) -> None:
         """Command the turn rate, and the speed meanwhile, that bring each robot to a heading."""
-        yaw, config = self.motion()[0][:, 3], self.config
-        self.command[:, 0] = self.cruise * slowdown(wanted, yaw, config.slowest)
-        self.command[:, 2] = turn_rate(wanted, yaw, config.max_turn_rate)
+        self.command[:, 0] = self.cruise * slowdown(wanted, yaw, self.config.slowest)
+        self.command[:, 2] = turn_rate(wanted, yaw, self.config.max_turn_rate)
 
     def _beside_line(self, pose: Tensor) -> Float[Tensor, "envs"]:
         """Return how far to the left of the straight line from its anchor each robot is, m."""

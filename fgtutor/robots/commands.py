@@ -48,7 +48,7 @@ class EnvConfig:
     obedience: float = 1.0
     """Share of the greatest turn rate at which a robot is expected to follow a new heading."""
     start_yaw: float = 0.15
-    """Greatest angle at which a crossing comes to its lane, rad; routes do at 45 degrees."""
+    """Greatest angle at which a crossing comes to its lane, rad; routes do at 45 or 90 degrees."""
     start_beside: float = 0.3
     """Greatest distance beside the corridor over the obstacle at which a crossing begins, m."""
     run_up: float = math.inf
