@@ -31,6 +31,7 @@ from fgtutor.robots.commands import (
     tracking_reward,
     turn_rate,
 )
+from fgtutor.robots.lanes import Lanes
 from fgtutor.symmetry import Mirror
 from fgtutor.terrain import World
 
@@ -104,7 +105,7 @@ class LocomotionEnv(VecEnv):
         self.turning = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.crossing = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.aside = torch.zeros(num_envs, device=device)
-        self._lay_lanes()
+        self.lanes = Lanes(world, self.config.run_up, device)
         self.tracking = torch.zeros(num_envs, 3, device=device)
         self.return_r_v = torch.zeros(num_envs, device=device)
         self.stuck_from = torch.zeros(num_envs, 2, device=device)
@@ -225,7 +226,7 @@ class LocomotionEnv(VecEnv):
         self.turning[ids] = self._uniform(n) < self.config.turn_share
         self.crossing[ids] = crossing
         beside = poses[:, 1] - self.tile_corner(ids)[:, 1] - self._lane(ids, poses[:, 0])
-        spread = self.spreads[self.row[ids], self.column[ids]]
+        spread = self.lanes.spreads[self.row[ids], self.column[ids]]
         self.aside[ids] = torch.minimum(torch.maximum(beside, -spread), spread)
 
     @plain_tensors
@@ -279,46 +280,25 @@ class LocomotionEnv(VecEnv):
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.random).to(self.device)
 
-    def _lay_lanes(self) -> None:
-        """Tabulate where on each tile crossings begin, and at every 0.1 m where its lane lies."""
-        x = np.arange(0.0, float(self.tile_size[0]) + 0.1, 0.1)
-        tiles = self.world.tiles
-        lanes = np.array(
-            [[np.interp(x, *np.array(sorted(t.lane)).T) for t in row] for row in tiles]
-        )
-        spreads = np.array([[tile.spread for tile in row] for row in tiles])
-        whole = (0.0, float(self.tile_size[0]))
-        limits = np.array([[tile.limits or whole for tile in row] for row in tiles])
-        ends = np.array([[(tile.start[0], tile.goal[0]) for tile in row] for row in tiles])
-        far = self.config.run_up * np.array([-1.0, 1.0])
-        near = np.array([[tile.span for tile in row] for row in tiles]) + far
-        near = np.clip(near, ends.min(-1, keepdims=True), ends.max(-1, keepdims=True))
-        self.lanes = torch.as_tensor(lanes, dtype=torch.float32, device=self.device)
-        self.spreads, self.limits, self.ends, self.near = (
-            torch.as_tensor(table, dtype=torch.float32, device=self.device)
-            for table in (spreads, limits, ends, near)
-        )
-
     def _lane(self, ids: Tensor, x: Tensor) -> Tensor:
         """Return how far to the left of its tile's corner each robot's lane lies at world x, m."""
         row, column = self.row[ids], self.column[ids]
-        along = ((x - self.offsets[row, column, 0]) / 0.1).round().long()
-        return self.lanes[row, column, along.clamp(0, self.lanes.shape[-1] - 1)]
+        return self.lanes.at(row, column, x - self.offsets[row, column, 0])
 
     def _draw_poses(self, ids: Tensor) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
         """Draw poses: before the obstacle to cross it, or anywhere the ground is level."""
         n, tries = len(ids), 8
         corner = self.tile_corner(ids)
         row, column = self.row[ids], self.column[ids]
-        first, last = self.limits[row, column].unbind(-1)
+        first, last = self.lanes.limits[row, column].unbind(-1)
         width = self.tile_size[1]
         backwards = self._uniform(n) < 0.3
         side = backwards.long()
-        x = self.ends[row, column, side]
+        x = self.lanes.ends[row, column, side]
         if math.isfinite(self.config.run_up):
-            x = x + self._uniform(n) * (self.near[row, column, side] - x)
+            x = x + self._uniform(n) * (self.lanes.near[row, column, side] - x)
         # Near enough to the lane to reach it before the obstacle begins.
-        beside = (self.spreads[row, column] + self.config.start_beside).clamp(max=0.3 * width)
+        beside = (self.lanes.spreads[row, column] + self.config.start_beside).clamp(max=0.3 * width)
         beside = beside * (2 * self._uniform(n) - 1)
         y = self._lane(ids, corner[:, 0] + x) + beside
         yaw = torch.where(backwards, torch.full((n,), math.pi), torch.zeros(n))
@@ -418,7 +398,7 @@ class LocomotionEnv(VecEnv):
     def _outside(self, pose: Tensor) -> tuple[Bool[Tensor, "envs"], Bool[Tensor, "envs"]]:
         """Tell which robots have left their tile, and which of them for a neighbour's obstacle."""
         x, y = (pose[:, :2] - self.tile_corner(torch.arange(self.num_envs))).unbind(dim=-1)
-        first, last = self.limits[self.row, self.column].unbind(-1)
+        first, last = self.lanes.limits[self.row, self.column].unbind(-1)
         beyond = (x < first) | (x > last)
         strange = beyond & (x > 0.0) & (x < self.tile_size[0])
         return beyond | (y < 0.0) | (y > self.tile_size[1]), strange
