@@ -224,7 +224,7 @@ def test_from_a_run_its_critic_and_net_come_along_and_nothing_warms_up(trained, 
     assert any(not torch.equal(v, policy.state_dict()[k]) for k, v in first.items())
 
 
-@pytest.mark.parametrize("part", ["", "specialist"])
+@pytest.mark.parametrize("part", ["", "specialist", "snapshots/25"])
 def test_a_run_does_not_overwrite_what_it_starts_from(tmp_path, part):
     with pytest.raises(ConfigError, match=r"would be overwritten .* give another --out"):
         TrainConfig(out=tmp_path, start_from=tmp_path / part)
