@@ -69,8 +69,12 @@ class SwitchingConfig(RunConfig):
     """Only these courses, such as steps-gaps; default: every pair of neighbours, and full."""
     planners: tuple[str, ...] = ()
     """Only these planners; default: all."""
-    switch_cost: float = 2.0
-    """Cost of a change of policy for the planners that heed it; a good step costs 1."""
+    switch_cost: float = 1.0
+    """Cost of a change of policy for the planners that heed it, in the unit of `cost` (metres or
+    steps where F is 1)."""
+    cost: Literal["inverse", "length"] = "length"
+    """Edge cost: 1 / F times the step's length; or 1 / F alone (the paper), by which a diagonal
+    step costs as much as a straight one and routes zigzag."""
     hold_steps: int = FollowConfig.hold_steps
     """Control steps for which another policy must be wanted, for the planners with hysteresis."""
     difficulty: float = 1.0
@@ -231,7 +235,7 @@ def run_task(config: SwitchingConfig, course: str, indices: Sequence[int]) -> li
         how = variant.planner, variant.switch_cost
         if how not in routes:
             routes[how] = [
-                _route(ground, view, variant, config.f_min)
+                _route(ground, view, variant, config)
                 for ground, view in zip(grounds, views, strict=True)
             ]
         for level in config.levels:
@@ -243,15 +247,16 @@ def run_task(config: SwitchingConfig, course: str, indices: Sequence[int]) -> li
     return rows
 
 
-def _route(ground: Terrain, view: View, variant: Variant, f_min: float) -> Route | None:
+def _route(ground: Terrain, view: View, variant: Variant, config: SwitchingConfig) -> Route | None:
     try:
         return find_route(
             variant.planner,
             view,
             ground.start,
             ground.goal,
-            f_min=f_min,
+            f_min=config.f_min,
             switch_cost=variant.switch_cost,
+            cost=config.cost,
         )
     except PlanningError:
         return None
@@ -370,8 +375,9 @@ def run(config: SwitchingConfig) -> int:
     caption = (
         f"Success in % with 95 % intervals, {config.trials:,} trials a cell; fixes with a standard "
         "deviation of noise (cm) and a drift (cm per root second), maps from a simulated scan; "
-        f"robot {config.robot}, tau {config.taus}, f_min {config.f_min:g}, switch cost "
-        f"{config.switch_cost:g}, hysteresis of {config.hold_steps} steps, seed {config.seed}."
+        f"robot {config.robot}, tau {config.taus}, cost {config.cost}, f_min {config.f_min:g}, "
+        f"switch cost {config.switch_cost:g}, hysteresis of {config.hold_steps} steps, "
+        f"seed {config.seed}."
     )
     print(f"{text}\n\n{caption}")
     if config.out:
