@@ -75,7 +75,7 @@ class AdaptationConfig(RunConfig):
     """Risers of the short, the middle and the long way, as shares of the robot's highest one."""
     taus: Literal["paper", "calibrated"] = "calibrated"
     """Thresholds of w_ood."""
-    f_min: float = 0.4
+    f_min: float = 0.45
     """Edges less feasible than this do not exist; a robot that may go around can be choosy."""
     cost: Literal["length", "inverse"] = "length"
     """Edge cost: 1 / F times the step's length; or 1 / F (the paper), by which a diagonal step is
