@@ -63,6 +63,12 @@ class TrainConfig:
     easiest: float = 0.1
     """Difficulty of the first row; that of the last is 1. More for a policy that goes on where
     another stopped."""
+    easiest_at_last: float | None = None
+    """Difficulty to which the first row's rises, a checkpoint at a time, as the robots outgrow it;
+    default: it stays."""
+    std_at_last: float | None = None
+    """Standard deviation of the action noise that is not exceeded when the first row has risen so
+    far; before, in proportion. Precise terrain is not learned with noise that falls off it."""
     neighbours: float = 0.0
     """Share of terrains with other obstacles at both ends, a landing away, as on mixed terrain; for
     a kind that mixed terrain has."""
@@ -114,6 +120,21 @@ class TrainConfig:
         for name, what in (("easiest", "difficulty"), ("neighbours", "share")):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be a {what} from 0 to 1, got {getattr(self, name)}")
+        last = self.easiest_at_last
+        if last is not None and not (self.easiest < last < 1 and self.rows > 1):
+            raise ConfigError(
+                f"easiest_at_last must lie above easiest, {self.easiest:g}, and below 1, and needs "
+                f"2 rows or more, got {last:g} and {self.rows}"
+            )
+        if self.std_at_last is not None and (last is None or not self.std_at_last > 0):
+            raise ConfigError(
+                f"std_at_last must be above 0 and needs easiest_at_last, got {self.std_at_last:g}"
+            )
+
+    @property
+    def first_std(self) -> float:
+        """Standard deviation of the action noise at the start."""
+        return self.warm_std if self.start_from else self.initial_std
 
     @property
     def folder(self) -> Path:
@@ -211,7 +232,7 @@ def runner_config(config: TrainConfig, env: LocomotionEnv) -> dict[str, Any]:
     network = {"class_name": "MLPModel", "hidden_dims": list(config.hidden), "activation": "elu"}
     noise = {
         "class_name": "GaussianDistribution",
-        "init_std": config.warm_std if config.start_from else config.initial_std,
+        "init_std": config.first_std,
         "std_type": "log",
         "std_range": (0.05, 2.0),
     }

@@ -1,4 +1,4 @@
-"""From a point cloud to an elevation map: remove outliers, sort points into cells, take medians.
+"""From a point cloud to an elevation map: remove outliers, sort points into cells, find the ground.
 
 Reads points [n, 3] in metres, z up (`cloudfiles` reads them from files); gives a `ScannedMap`: the
 `ElevationMap` that planning takes, and per cell how many points it rests on and how they spread.
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from fgtutor.cloudfiles import Points, finite
@@ -25,6 +26,15 @@ VOXEL = 0.05
 """Side of a voxel, m (paper); a cell is divided into whole voxels as near to it as possible."""
 MOST_CELLS = 50_000_000
 """Larger maps are refused, since they almost always come from a wrong unit: 350 m x 350 m."""
+WALL = 0.2
+"""Points of a cell that are spread over more than this lie on a wall too, m. No step is so high,
+and no slope that can be walked rises so far within a cell."""
+LAYER = 0.08
+"""Thickness of the layer in which the points of level ground lie, m: twice two standard deviations
+of a MID-360's range."""
+AROUND = 0.15
+"""How far level ground is looked for, m, which tells how many points such a layer holds here."""
+_TICK = 1e-4
 _TICK = 1e-4
 """Heights are sorted in steps of this, m; far below what any scanner resolves."""
 
@@ -71,8 +81,10 @@ class ScannedMap:
     """An elevation map, and what each cell of it rests on."""
 
     elevation: ElevationMap
-    """The median height of each cell's points; cells with too few are unknown. The median leaves an
-    edge where it is: anything higher would grow every block and narrow every gap."""
+    """The median height of each cell's points; beside a wall, of those on top of it or at its foot,
+    whichever the cell is. Cells with too few are unknown. So an edge stays where it is: anything
+    higher would grow every block and narrow every gap, of which a scanner sees more wall than
+    floor."""
     count: Int[np.ndarray, "nx ny"]
     """Points in each cell."""
     lowest: Float[np.ndarray, "nx ny"]
@@ -231,13 +243,23 @@ def _statistics(
         return z[first + np.ceil(share * count).astype(np.int64) - 1]
 
     variance = total((z - np.repeat(total(z) / count, count)) ** 2) / count
-
     where = np.unravel_index(cell[first], shape)
 
     def grid(values: np.ndarray, empty: float = np.nan) -> np.ndarray:
         full = np.full(shape, empty, dtype=np.float32)
         full[where] = values
         return full
+
+    lowest, p95 = z[first], quantile(0.95)
+    walled = p95 - lowest > WALL
+    on_top = total((z > np.repeat(p95 - LAYER, count)).astype(np.int64))
+    around = 2 * round(AROUND / config.resolution) + 1
+    level = ndimage.maximum_filter(grid(np.where(walled, 0, count), empty=0.0), size=around)
+    # What a wall holds up shows as many points on top as level ground. What lies at its foot shows
+    # there only those of the wall that fall into its cell: fewer, or a small share of its own.
+    foot = walled & ((on_top < 0.5 * level[where]) | (on_top < 0.3 * count))
+    top = z[first + count - 1 - on_top // 2]
+    heights = np.where(foot, quantile(0.05), np.where(walled, top, quantile(0.5)))
 
     enough = count >= config.min_points
     if not enough.any():
@@ -249,11 +271,13 @@ def _statistics(
     counts[where] = count
     return ScannedMap(
         elevation=ElevationMap(
-            grid(np.where(enough, quantile(0.5), np.nan)), config.resolution, origin
+            grid(np.where(enough, heights, np.nan)),
+            config.resolution,
+            origin,
         ),
         count=counts,
-        lowest=grid(z[first]),
-        p95=grid(quantile(0.95)),
+        lowest=grid(lowest),
+        p95=grid(p95),
         variance=grid(variance),
         outliers=outliers,
         overhanging=overhanging,

@@ -10,6 +10,7 @@ Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
 import contextlib
 import io
 import json
+import math
 import os
 import signal
 import time
@@ -46,6 +47,10 @@ __all__ = ["A1TrainConfig", "TrainConfig", "Trainer", "config_of", "run", "train
 
 CHECKPOINT = "checkpoint.pt"
 """The file in a run's folder from which it goes on."""
+OUTGROWN = 0.45
+"""Share of the way to the last row at which, on the mean, robots have outgrown the first one."""
+LIFT = 0.25
+"""Share of what is missing to full difficulty by which the first row is then lifted."""
 
 
 class Trainer:
@@ -55,6 +60,7 @@ class Trainer:
         """Build the world, the robots and the learner; nothing is simulated yet."""
         self.config = config
         self.iteration = 0
+        self.easiest = config.easiest
         torch.set_num_threads(config.threads)
         torch.manual_seed(distributed.own_seed(config.seed))
         self.env = self._make_env()
@@ -93,7 +99,15 @@ class Trainer:
     def _make_env(self) -> LocomotionEnv:
         """Build this process's robots, on the CPU as their physics, on ground of its own."""
         seed = distributed.own_seed(self.config.seed)
-        return make_training_env(replace(self.config, seed=seed, device="cpu"), self.iteration)
+        config = replace(
+            self.config,
+            seed=seed,
+            device="cpu",
+            easiest=self.easiest,
+            easiest_at_last=None,
+            std_at_last=None,
+        )
+        return make_training_env(config, self.iteration)
 
     def _start_from(self, folder: Path) -> None:
         """Take over a trained policy, all but its action noise.
@@ -132,6 +146,7 @@ class Trainer:
         for group in self.algorithm.feasibility_optimizer.param_groups:
             group["lr"] = self.config.feasibility_learning_rate * 0.05**done
         self.runner.learn(1)
+        self._quieten()
         self.iteration += 1
         self.seconds += time.monotonic() - began
         row = {
@@ -141,6 +156,7 @@ class Trainer:
             **distributed.mean(
                 {
                     "row": self.env.row.float().mean().item(),
+                    "easiest": self.easiest,
                     "std": self.algorithm.get_policy().output_std.mean().item(),
                     **self.algorithm.metrics,
                 }
@@ -148,6 +164,31 @@ class Trainer:
         }
         self.history.append(row)
         return row
+
+    def _harden(self, rows: torch.Tensor) -> torch.Tensor:
+        """Lift the first row where the robots have outgrown it; return the rows they stand on then.
+
+        A robot keeps its difficulty, as far as there is still such a row.
+        """
+        config, last = self.config, self.config.easiest_at_last
+        top = config.rows - 1
+        if last is None or self.easiest >= last or self.history[-1]["row"] < OUTGROWN * top:
+            return rows
+        difficulty = self.easiest + (1 - self.easiest) * rows / top
+        self.easiest = min(last, self.easiest + LIFT * (1 - self.easiest))
+        lifted = top * (difficulty - self.easiest) / (1 - self.easiest)
+        return lifted.round().clamp(min=0).long()
+
+    @torch.no_grad()
+    def _quieten(self) -> None:
+        """Hold the action noise down as far as the first row has risen."""
+        config = self.config
+        if config.easiest_at_last is None or config.std_at_last is None:
+            return
+        risen = (self.easiest - config.easiest) / (config.easiest_at_last - config.easiest)
+        most = config.first_std * (config.std_at_last / config.first_std) ** risen
+        noise = self.algorithm.get_policy().get_parameter("distribution.log_std_param")
+        noise.clamp_(max=math.log(most))
 
     def save(self) -> None:
         """Write the checkpoint atomically, and a snapshot, and go on in a new world.
@@ -160,6 +201,7 @@ class Trainer:
         Of several processes the first one writes, for all of them.
         """
         mine = {"env": self.env.state_dict(), "torch_random": torch.get_rng_state()}
+        mine["env"]["row"] = self._harden(mine["env"]["row"])
         first, *others = distributed.gather(mine)
         if leads():
             self._write(first | {"others": others})
@@ -171,6 +213,7 @@ class Trainer:
         state = {
             "config": json.dumps(comparable(self.config)),
             "iteration": self.iteration,
+            "easiest": self.easiest,
             "seconds": self.seconds,
             "history": json.dumps(self.history),
             "algorithm": self.algorithm.save(),
@@ -218,6 +261,7 @@ class Trainer:
         warm = state["iteration"] < self.critic_warmup
         self.algorithm.get_policy().requires_grad_(not warm)
         self.iteration, self.seconds = state["iteration"], state["seconds"]
+        self.easiest = state.get("easiest", self.easiest)
         self._renew(own["env"])
         self.history = state["history"]
         torch.set_rng_state(own["torch_random"])

@@ -207,8 +207,26 @@ def test_a_gap_stays_a_gap_of_its_width() -> None:
     gap = truth.heights < -0.3
     low = scanned.elevation.filled().heights < -0.1
     assert gap.any()
-    assert low.sum() == pytest.approx(gap.sum(), rel=0.3)
-    assert (low & gap).sum() > 0.8 * gap.sum()
+    assert low.sum() == pytest.approx(gap.sum(), rel=0.05)
+    assert (low & gap).sum() > 0.95 * gap.sum()
+
+
+@pytest.mark.parametrize("name", ["gaps", "bridge"])
+def test_beside_a_chasm_the_edge_keeps_its_height_and_the_floor_its_depth(name: str) -> None:
+    terrain = make_terrain(name, robot="a1", seed=3)
+    truth = terrain.elevation
+    config = ScanConfig(resolution=truth.resolution)
+    points = scan_terrain(terrain, poses=survey(terrain, spacing=0.2), seed=1)
+    scanned = map_points(points, config=config, area=truth.extent).elevation
+    error = np.abs(scanned.heights - truth.heights)
+    lowest, highest = (
+        f(truth.heights, 3) for f in (ndimage.minimum_filter, ndimage.maximum_filter)
+    )
+    beside = scanned.known & (highest - lowest > 0.3)
+    floor = beside & (truth.heights < -0.3)
+    assert min(floor.sum(), (beside & ~floor).sum()) > 100
+    assert (error[beside & ~floor] < 0.03).mean() > 0.95
+    assert (error[floor] < 0.1).mean() > 0.9
 
 
 def test_what_lies_in_the_shadow_of_a_wall_stays_unknown() -> None:

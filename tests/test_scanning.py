@@ -234,7 +234,7 @@ def test_statistics_by_hand() -> None:
     st.integers(1, 3),
 )
 def test_statistics_against_a_naive_loop(n: int, seed: int, step: float, least: int) -> None:
-    points = np.random.default_rng(seed).uniform((-0.2, 0.3, -1), (0.2, 0.5, 0.4), (n, 3))
+    points = np.random.default_rng(seed).uniform((-0.2, 0.3, 0.25), (0.2, 0.5, 0.4), (n, 3))
     points = np.concatenate((points, np.full((least, 3), 0.4)))  # one cell is surely known
     area = (-0.2, 0.3, 0.6, 0.6)
     config = ScanConfig(resolution=step, neighbours=0, min_points=least)
