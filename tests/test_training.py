@@ -352,6 +352,61 @@ def test_rows_rise_from_the_easiest_difficulty_to_the_whole():
         TrainConfig(neighbours=-0.1)
 
 
+RISING = TINY | {"rows": 5, "easiest": 0.2, "easiest_at_last": 0.8, "std_at_last": 0.1}
+
+
+def test_the_first_row_rises_where_robots_have_outgrown_it_and_they_keep_their_difficulty(tmp_path):
+    config = TrainConfig(out=tmp_path, **RISING)
+    trainer = Trainer(config)
+    trainer.iterate()
+    trainer.save()
+    assert trainer.easiest == 0.2  # they stand on the first row
+    trainer.iterate()
+    trainer.history[-1]["row"] = 2.0
+    trainer.env.row[:] = torch.tensor([0, 2, 3, 4])
+    trainer.save()
+    # A quarter of what was missing: rows of 0.2, 0.4 .. 1 become 0.4, 0.55, 0.7, 0.85, 1.
+    assert trainer.easiest == pytest.approx(0.4)
+    assert trainer.env.row.tolist() == [0, 1, 3, 4]
+    first, *_, last = training_world(dataclasses.replace(config, easiest=0.4)).tiles
+    assert (first[0].difficulty, last[0].difficulty) == (0.4, 1.0)
+    again = Trainer(dataclasses.replace(config, resume=True))
+    again.resume()
+    assert again.easiest == trainer.easiest and torch.equal(again.env.row, trainer.env.row)
+    assert again.env.ground.tolist() == trainer.env.ground.tolist()
+    for _ in range(9):
+        trainer.history[-1]["row"] = 4.0
+        trainer.save()
+    assert trainer.easiest == 0.8
+
+
+def test_the_noise_falls_as_the_first_row_rises(tmp_path):
+    trainer = Trainer(TrainConfig(out=tmp_path, **RISING))
+    assert trainer.iterate()["std"] == pytest.approx(0.6, abs=0.05)
+    trainer.easiest = 0.5
+    noise = trainer.algorithm.get_policy().get_parameter("distribution.log_std_param")
+    trainer.iterate()
+    assert noise.exp().max().item() <= (0.6 * 0.1) ** 0.5 + 1e-6  # half way, geometrically
+    trainer.easiest = 0.8
+    trainer.iterate()
+    assert noise.exp().max().item() <= 0.1 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"easiest": 0.5, "easiest_at_last": 0.5}, r"must lie above easiest, 0\.5, and below 1"),
+        ({"easiest_at_last": 1.0}, "below 1, and needs 2 rows or more, got 1 and 6"),
+        ({"rows": 1, "easiest_at_last": 0.5}, r"got 0\.5 and 1"),
+        ({"std_at_last": 0.1}, "needs easiest_at_last"),
+        ({"easiest_at_last": 0.5, "std_at_last": 0.0}, "must be above 0"),
+    ],
+)
+def test_a_first_row_that_cannot_rise_is_refused(fields, message):
+    with pytest.raises(ConfigError, match=message):
+        TrainConfig(**fields)
+
+
 def test_a_share_of_the_terrains_has_neighbours_where_there_can_be_any():
     config = TrainConfig(terrain="gaps", rows=5, columns=20, neighbours=0.5)
     tiles = [tile for row in training_world(config).tiles for tile in row]
