@@ -39,6 +39,23 @@ def test_the_folder_is_missing_and_then_there(config):
     assert (config.zoo / "steps" / "specialist.json").exists()
 
 
+def test_a_newcomer_may_lie_outside_the_zoo(config, make_rolling, tmp_path):
+    folder = save_specialist(make_rolling("rubble", f=0.8), tmp_path / "run" / "specialist")
+    outside = replace(config, newcomer=str(folder))
+    assert [list(zoo) for zoo in zoos(outside)] == [["gaps", "steps"], ["gaps", "rubble", "steps"]]
+    assert outside.zoo_digests().keys() == {"gaps", "general", "specialist", "steps"}
+    assert run(outside) == 0
+    written = (config.out / "table.md").read_text()
+    assert "tensors of gaps, steps are bit-identical without and with rubble on all 4" in written
+    assert not (config.zoo / "rubble").exists()
+
+
+def test_a_newcomer_of_a_name_that_the_zoo_has_is_refused(config, make_rolling, tmp_path):
+    folder = save_specialist(make_rolling("gaps"), tmp_path / "elsewhere")
+    with pytest.raises(ConfigError, match="gaps is in the zoo already"):
+        run(replace(config, newcomer=str(folder)))
+
+
 def test_the_report_tells_before_from_after(config, capsys):
     assert run(config) == 0
     printed = capsys.readouterr().out

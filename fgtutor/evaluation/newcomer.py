@@ -21,7 +21,7 @@ from fgtutor.evaluation.report import Share, markdown
 from fgtutor.evaluation.runner import Row
 from fgtutor.evaluation.success import TrialsConfig, by_cell, make_ground, summarise
 from fgtutor.evaluation.trials import drive
-from fgtutor.specialist import ZOO, Specialist, load_zoo
+from fgtutor.specialist import DESCRIPTION, GENERAL, ZOO, Specialist, load_specialist, load_zoo
 from fgtutor.terrain import SCALES
 
 COMMAND = "evaluate newcomer"
@@ -34,11 +34,33 @@ class NewcomerConfig(TrialsConfig):
     """Evaluate our planner without and with one of the specialists."""
 
     newcomer: str = "rubble"
-    """Name of the specialist to leave out and to add; its folder lies in the zoo."""
+    """Name of the specialist of the zoo to leave out and to add; or the folder of one that is not
+    in the zoo, to add."""
     terrain: str | None = None
     """The terrain that it is for; default: the one that it was trained on."""
     others: tuple[str, ...] = ()
     """Terrains that must not suffer; default: the robot's own and mixed."""
+
+    @property
+    def home(self) -> Path:
+        """Where the newcomer's folder lies."""
+        inside = (self.zoo or ZOO / self.robot) / self.newcomer
+        return inside if (inside / DESCRIPTION).is_file() else Path(self.newcomer)
+
+    @property
+    def name(self) -> str:
+        """What the newcomer is called; in the zoo, as its folder."""
+        return self.home.name if self.home in super().folders else load_specialist(self.home).name
+
+    @property
+    def folders(self) -> list[Path]:
+        """The folders of the zoo and the newcomer's."""
+        return sorted({*super().folders, self.home})
+
+    def load_zoo(self) -> dict[str, Specialist]:
+        """Return the zoo with the newcomer."""
+        *_, zoo = zoos(self)
+        return zoo
 
 
 def terrains(config: NewcomerConfig) -> tuple[str, ...]:
@@ -47,12 +69,20 @@ def terrains(config: NewcomerConfig) -> tuple[str, ...]:
     Raises `ConfigError` if the zoo holds no such specialist, or no other.
     """
     zoo = load_zoo(config.robot, config.zoo)
-    if config.newcomer not in zoo or len(zoo) == 1:
+    inside = config.newcomer in zoo
+    outside = config.newcomer != GENERAL and (config.home / DESCRIPTION).is_file()
+    if not (inside or outside) or not zoo.keys() - {config.newcomer}:
         raise ConfigError(
             f"need a newcomer and others in {config.zoo or ZOO / config.robot}, asked for "
-            f"{config.newcomer!r} of {', '.join(zoo)}: put its folder there, or choose another"
+            f"{config.newcomer!r} of {', '.join(zoo)}: give another name, or a specialist's folder"
         )
-    its_own = config.terrain or zoo[config.newcomer].provenance.get("terrain", config.newcomer)
+    if not inside and config.name in zoo:
+        raise ConfigError(
+            f"{config.name} is in the zoo already: leave it out by its name, not {config.newcomer}"
+        )
+    its_own = config.terrain or config.load_zoo()[config.name].provenance.get(
+        "terrain", config.name
+    )
     return tuple(
         dict.fromkeys((its_own, *(config.others or (*SCALES[config.robot].mixed, "mixed"))))
     )
@@ -62,12 +92,11 @@ def zoos(config: NewcomerConfig) -> Iterator[dict[str, Specialist]]:
     """Give the zoo without the newcomer's folder and then with it, both read from disk."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        paths = {path.name: path for path in config.folders}
-        newcomer = paths.pop(config.newcomer)
-        for other, path in paths.items():
-            shutil.copytree(path, folder / other)
+        for path in config.folders:
+            if path != config.home:
+                shutil.copytree(path, folder / path.name)
         yield load_zoo(config.robot, folder)
-        shutil.copytree(newcomer, folder / config.newcomer)
+        shutil.copytree(config.home, folder / config.name)
         yield load_zoo(config.robot, folder)
 
 
@@ -152,13 +181,14 @@ def table(trials: Sequence[Row], newcomer: str) -> str:
 
 def run(config: NewcomerConfig) -> int:
     """Evaluate from the command line, print the table and write rows and report."""
+    grounds = terrains(config)
     return success.run_and_report(
         config,
         COMMAND,
-        title=f"Ours without and with {config.newcomer} ({config.robot})",
-        terrains=terrains(config),
+        title=f"Ours without and with {config.name} ({config.robot})",
+        terrains=grounds,
         policies=STAGES,
-        table=partial(table, newcomer=config.newcomer),
+        table=partial(table, newcomer=config.name),
         work=run_task,
-        remark=partial(compare_tensors, newcomer=config.newcomer),
+        remark=partial(compare_tensors, newcomer=config.name),
     )
