@@ -8,6 +8,7 @@ Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
 """
 
 import contextlib
+import ctypes
 import io
 import json
 import math
@@ -231,6 +232,7 @@ class Trainer:
         self.env = self.runner.env = self._make_env()
         self.env.load_state_dict(state)
         self.env.reset_all()
+        _give_back_memory()
 
     def resume(self) -> None:
         """Continue from the run folder's checkpoint.
@@ -293,6 +295,15 @@ class Trainer:
                 "curve": self.history[::every],
             },
         )
+
+
+def _give_back_memory() -> None:
+    """Ask glibc, where there is one, to return to the system what the last world has freed.
+
+    It keeps freed pieces between others still in use: 0.4 GB for each world of 640 A1s.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def _read(checkpoint: Path) -> dict[str, Any]:
