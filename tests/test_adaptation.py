@@ -290,4 +290,4 @@ def test_the_command_line_reads_its_options():
     words = ["--heights", "0.9", "0.6", "0.1", "--robot", "a1", "--cost", "inverse"]
     config = tyro.cli(AdaptationConfig, args=words)
     assert config.heights == (0.9, 0.6, 0.1) and config.cost == "inverse"
-    assert config.folder == ZOO / "a1" / "_checkpoints"
+    assert config.home == ZOO / "a1" / "_checkpoints"

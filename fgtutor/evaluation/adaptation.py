@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -27,10 +26,11 @@ from fgtutor.errors import ConfigError, PlanningError, TerrainError
 from fgtutor.evaluation.cost import estimate
 from fgtutor.evaluation.mapchart import draw_maps
 from fgtutor.evaluation.metrics import spl
+from fgtutor.evaluation.planned import PlannedConfig
 from fgtutor.evaluation.report import Share, markdown, write_report
 from fgtutor.evaluation.runner import Row, Task
-from fgtutor.evaluation.shards import RunConfig, collect, finished, settings_of
-from fgtutor.evaluation.success import TrialsConfig, terrain_seed
+from fgtutor.evaluation.shards import collect, finished, settings_of
+from fgtutor.evaluation.success import terrain_seed
 from fgtutor.execution import execute_batch
 from fgtutor.obstacles import SCALES, Course
 from fgtutor.pipeline import plan_on_map
@@ -60,26 +60,17 @@ RESAMPLES = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptationConfig(RunConfig):
+class AdaptationConfig(PlannedConfig):
     """Plan with early, mid and late checkpoints of one policy, the paper's Table I."""
 
-    robot: str = "toy"
-    """Which robot."""
     trials: int = 100
     """Trials per checkpoint."""
     maps: int = 20
     """Maps that the trials are spread over; their steps differ a little."""
-    seed: int = 0
-    """What maps and starts are drawn from."""
     heights: tuple[float, float, float] = (0.87, 0.67, 0.2)
     """Risers of the short, the middle and the long way, as shares of the robot's highest one."""
-    taus: Literal["paper", "calibrated"] = "calibrated"
-    """Thresholds of w_ood."""
     f_min: float = 0.45
     """Edges less feasible than this do not exist; a robot that may go around can be choosy."""
-    cost: Literal["length", "inverse"] = "length"
-    """Edge cost: 1 / F times the step's length; or 1 / F (the paper), by which a diagonal step is
-    no longer than a straight one, and a route may zigzag."""
     zoo: Path | None = None
     """Folder of checkpoints, a specialist folder each; default: those of the shipped steps."""
 
@@ -91,13 +82,13 @@ class AdaptationConfig(RunConfig):
             raise ConfigError(f"heights must be shares from 0 to 1.5, got {self.heights}")
 
     @property
-    def folder(self) -> Path:
+    def home(self) -> Path:
         """Where the checkpoints lie."""
         return self.zoo or ZOO / self.robot / CHECKPOINTS
 
     def load_checkpoints(self) -> dict[str, Specialist]:
         """Return the checkpoints by name, the least trained one first."""
-        zoo = load_zoo(self.robot, self.folder, include_general=True)
+        zoo = load_zoo(self.robot, self.home, include_general=True)
         return dict(sorted(zoo.items(), key=lambda item: item[1].provenance.get("samples", 0)))
 
     def seeds(self, index: int) -> tuple[int, ...]:
@@ -323,8 +314,7 @@ def run(config: AdaptationConfig) -> int:
     began = time.time()
     zoo, tasks = config.load_checkpoints(), make_tasks(config)
     first = make_map(config.robot, terrain_seed(config.seed, 0), config.heights)
-    digests = TrialsConfig(robot=config.robot, zoo=config.folder).zoo_digests()
-    settings = settings_of(config, COMMAND, zoo=digests)
+    settings = settings_of(config, COMMAND, zoo=config.zoo_digests())
     left = len(tasks) - len(finished(tasks, settings, config))
     if left:
         # The estimate takes the straight line for the length of a trial.

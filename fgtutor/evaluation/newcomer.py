@@ -21,7 +21,7 @@ from fgtutor.evaluation.report import Share, markdown
 from fgtutor.evaluation.runner import Row
 from fgtutor.evaluation.success import TrialsConfig, by_cell, make_ground, summarise
 from fgtutor.evaluation.trials import drive
-from fgtutor.specialist import DESCRIPTION, GENERAL, ZOO, Specialist, load_specialist, load_zoo
+from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist, load_zoo
 from fgtutor.terrain import SCALES
 
 COMMAND = "evaluate newcomer"
@@ -42,20 +42,24 @@ class NewcomerConfig(TrialsConfig):
     """Terrains that must not suffer; default: the robot's own and mixed."""
 
     @property
-    def home(self) -> Path:
+    def folder(self) -> Path:
         """Where the newcomer's folder lies."""
-        inside = (self.zoo or ZOO / self.robot) / self.newcomer
+        inside = self.home / self.newcomer
         return inside if (inside / DESCRIPTION).is_file() else Path(self.newcomer)
 
     @property
     def name(self) -> str:
         """What the newcomer is called; in the zoo, as its folder."""
-        return self.home.name if self.home in super().folders else load_specialist(self.home).name
+        return (
+            self.folder.name
+            if self.folder in super().folders
+            else load_specialist(self.folder).name
+        )
 
     @property
     def folders(self) -> list[Path]:
         """The folders of the zoo and the newcomer's."""
-        return sorted({*super().folders, self.home})
+        return sorted({*super().folders, self.folder})
 
     def load_zoo(self) -> dict[str, Specialist]:
         """Return the zoo with the newcomer."""
@@ -70,10 +74,10 @@ def terrains(config: NewcomerConfig) -> tuple[str, ...]:
     """
     zoo = load_zoo(config.robot, config.zoo)
     inside = config.newcomer in zoo
-    outside = config.newcomer != GENERAL and (config.home / DESCRIPTION).is_file()
+    outside = config.newcomer != GENERAL and (config.folder / DESCRIPTION).is_file()
     if not (inside or outside) or not zoo.keys() - {config.newcomer}:
         raise ConfigError(
-            f"need a newcomer and others in {config.zoo or ZOO / config.robot}, asked for "
+            f"need a newcomer and others in {config.home}, asked for "
             f"{config.newcomer!r} of {', '.join(zoo)}: give another name, or a specialist's folder"
         )
     if not inside and config.name in zoo:
@@ -93,10 +97,10 @@ def zoos(config: NewcomerConfig) -> Iterator[dict[str, Specialist]]:
     with TemporaryDirectory() as name:
         folder = Path(name)
         for path in config.folders:
-            if path != config.home:
+            if path != config.folder:
                 shutil.copytree(path, folder / path.name)
         yield load_zoo(config.robot, folder)
-        shutil.copytree(config.home, folder / config.name)
+        shutil.copytree(config.folder, folder / config.name)
         yield load_zoo(config.robot, folder)
 
 

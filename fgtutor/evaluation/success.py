@@ -5,7 +5,6 @@ Trial k of a terrain is the same ground, start and goal for all planners.
 Source: paper, Sec. IV-B: 40 tasks of 250 trials a terrain, failures by reason.
 """
 
-import hashlib
 import os
 import time
 from collections import Counter
@@ -21,11 +20,11 @@ from fgtutor.errors import ConfigError, ReportError
 from fgtutor.evaluation.chart import share_chart
 from fgtutor.evaluation.cost import estimate
 from fgtutor.evaluation.metrics import wilson_interval
+from fgtutor.evaluation.planned import PlannedConfig
 from fgtutor.evaluation.report import Share, write_report
 from fgtutor.evaluation.runner import Row, Task
-from fgtutor.evaluation.shards import RunConfig, collect, finished, settings_of
+from fgtutor.evaluation.shards import collect, finished, settings_of
 from fgtutor.evaluation.trials import Ground, drive
-from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo
 from fgtutor.storage import check_writable, write_json
 from fgtutor.terrain import Terrain, make_terrain
 
@@ -38,32 +37,19 @@ CLEARANCE = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialsConfig(RunConfig):
+class TrialsConfig(PlannedConfig):
     """What success rates are measured on."""
 
-    robot: str = "toy"
-    """Which robot."""
     trials: int | None = None
     """Trials per policy and terrain; default: 50, for the paper's protocol its 10,000."""
-    seed: int = 0
-    """What the terrains and the starts are drawn from."""
     protocol: Literal["grounds", "paper"] = "grounds"
     """"grounds" crosses a new ground in each trial; "paper" draws 40 grounds with a start and a
     goal each (mixed: its own) and crosses each 250 times."""
     difficulty: float = 1.0
     """Difficulty of all terrains."""
-    taus: Literal["paper", "calibrated"] = "calibrated"
-    """Thresholds of w_ood."""
-    f_min: float = 0.1
-    """Edges less feasible than this do not exist."""
     switch_cost: float = 0.0
     """Extra cost of changing the policy, in the unit of `cost` (metres or steps where F is 1); 0 is
     the paper's."""
-    cost: Literal["inverse", "length"] = "length"
-    """Edge cost: 1 / F times the step's length; or 1 / F alone (the paper), by which a diagonal
-    step costs as much as a straight one and routes zigzag."""
-    zoo: Path | None = None
-    """Folder of specialist folders; default: the shipped zoo."""
     json: Path | None = None
     """Write the table's rows here."""
 
@@ -81,23 +67,6 @@ class TrialsConfig(RunConfig):
     def grounds(self) -> int:
         """Grounds per terrain."""
         return min(self.count, PAPER_GROUNDS) if self.protocol == "paper" else self.count
-
-    @property
-    def folders(self) -> list[Path]:
-        """The specialists' folders in the zoo."""
-        home = self.zoo or ZOO / self.robot
-        return sorted(path.parent for path in home.glob(f"[!._]*/{DESCRIPTION}"))
-
-    def load_zoo(self) -> dict[str, Specialist]:
-        """Return the specialists and the generalist, if there is one."""
-        return load_zoo(self.robot, self.zoo, include_general=True)
-
-    def zoo_digests(self) -> dict[str, str]:
-        """Return a digest of each of them, which changes with any of its weights."""
-        return {
-            folder.name: hashlib.sha256((folder / DESCRIPTION).read_bytes()).hexdigest()[:16]
-            for folder in self.folders
-        }
 
 
 def terrain_seed(seed: int, trial: int) -> int:

@@ -16,7 +16,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,16 +25,17 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, PlanningError, TerrainError
 from fgtutor.evaluation.chart import share_chart
 from fgtutor.evaluation.cost import estimate
+from fgtutor.evaluation.planned import PlannedConfig
 from fgtutor.evaluation.report import Draw, Share, markdown, write_report
 from fgtutor.evaluation.runner import Row, Task
-from fgtutor.evaluation.shards import RunConfig, collect, finished, settings_of
-from fgtutor.evaluation.success import GROUNDS, TrialsConfig, terrain_seed
+from fgtutor.evaluation.shards import collect, finished, settings_of
+from fgtutor.evaluation.success import GROUNDS, terrain_seed
 from fgtutor.execution import FollowConfig, execute_batch
 from fgtutor.obstacles import OBSTACLES, SCALES, Course
 from fgtutor.robots.lidar import scan_terrain, survey
 from fgtutor.routes import Route
 from fgtutor.scanning import ScanConfig, map_points
-from fgtutor.specialist import GENERAL, Specialist, load_zoo
+from fgtutor.specialist import GENERAL, Specialist
 from fgtutor.terrain import Section, Terrain, rasterise
 
 T = TypeVar("T")
@@ -53,15 +54,11 @@ change only for a step that the old and the new one can both take."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class SwitchingConfig(RunConfig):
+class SwitchingConfig(PlannedConfig):
     """Drive from terrain to terrain on scanned maps, the paper's Table III."""
 
-    robot: str = "toy"
-    """Which robot."""
     trials: int = 50
     """Trials per course, planner and level of noise, each on a ground of its own."""
-    seed: int = 0
-    """What grounds, scans and starts are drawn from."""
     levels: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.03, 0.0), (0.03, 0.01), (0.06, 0.02))
     """Localisation errors: standard deviation of each fix, m, and its drift, m per square root of a
     second."""
@@ -72,21 +69,12 @@ class SwitchingConfig(RunConfig):
     switch_cost: float = 1.0
     """Cost of a change of policy for the planners that heed it, in the unit of `cost` (metres or
     steps where F is 1)."""
-    cost: Literal["inverse", "length"] = "length"
-    """Edge cost: 1 / F times the step's length; or 1 / F alone (the paper), by which a diagonal
-    step costs as much as a straight one and routes zigzag."""
     hold_steps: int = FollowConfig.hold_steps
     """Control steps for which another policy must be wanted, for the planners with hysteresis."""
     difficulty: float = 1.0
     """Difficulty of all terrains."""
     scan_spacing: float = 0.2
     """Distance between two poses of the scanner, m."""
-    taus: Literal["paper", "calibrated"] = "calibrated"
-    """Thresholds of w_ood."""
-    f_min: float = 0.1
-    """Edges less feasible than this do not exist."""
-    zoo: Path | None = None
-    """Folder of specialist folders; default: the shipped zoo."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -99,10 +87,6 @@ class SwitchingConfig(RunConfig):
             raise ConfigError(f"levels must be pairs of numbers >= 0, got {self.levels}")
         if not self.scan_spacing > 0:
             raise ConfigError(f"need a scan_spacing above 0 m, got {self.scan_spacing}")
-
-    def load_zoo(self) -> dict[str, Specialist]:
-        """Return the specialists and the generalist, if there is one."""
-        return load_zoo(self.robot, self.zoo, include_general=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -352,8 +336,7 @@ def run(config: SwitchingConfig) -> int:
     began = time.time()
     zoo, tasks = config.load_zoo(), make_tasks(config)
     planners = variants(config, zoo)
-    digests = TrialsConfig(robot=config.robot, zoo=config.zoo).zoo_digests()
-    settings = settings_of(config, COMMAND, zoo=digests)
+    settings = settings_of(config, COMMAND, zoo=config.zoo_digests())
     left = len(tasks) - len(finished(tasks, settings, config))
     if left:
         grounds = [lay_course(kinds, robot=config.robot) for kinds in courses(config).values()]
