@@ -171,9 +171,10 @@ class Trainer:
 
         A robot keeps its difficulty, as far as there is still such a row.
         """
-        config, last = self.config, self.config.easiest_at_last
-        top = config.rows - 1
-        if last is None or self.easiest >= last or self.history[-1]["row"] < OUTGROWN * top:
+        last, top = self.config.easiest_at_last, self.config.rows - 1
+        if last is None or self.easiest >= last or top < 1:
+            return rows
+        if self.history[-1]["row"] < OUTGROWN * top:
             return rows
         difficulty = self.easiest + (1 - self.easiest) * rows / top
         self.easiest = min(last, self.easiest + LIFT * (1 - self.easiest))
@@ -183,10 +184,11 @@ class Trainer:
     @torch.no_grad()
     def _quieten(self) -> None:
         """Hold the action noise down as far as the first row has risen."""
-        config = self.config
-        if config.easiest_at_last is None or config.std_at_last is None:
+        config, last = self.config, self.config.easiest_at_last
+        if last is None or config.std_at_last is None:
             return
-        risen = (self.easiest - config.easiest) / (config.easiest_at_last - config.easiest)
+        way = last - config.easiest
+        risen = (self.easiest - config.easiest) / way if way > 0 else 1.0
         most = config.first_std * (config.std_at_last / config.first_std) ** risen
         noise = self.algorithm.get_policy().get_parameter("distribution.log_std_param")
         noise.clamp_(max=math.log(most))
