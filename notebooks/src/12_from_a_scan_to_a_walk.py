@@ -55,6 +55,9 @@ draw_cloud(glance, sensors=eyes, title="One look of a tenth of a second")
 # Sort the points into cells, and take one height from each. The *highest* point, since a foot is
 # stopped by it? Then every edge grows by the sensor's noise, and every narrow gap closes. We take
 # the **median**, and keep what else the cell knows: how many points, how low, how scattered.
+# One place needs more: at the foot of a wall a scanner sees more wall than floor, and the median
+# would fill every slot half up. Where a cell's points reach over 20 cm, we ask whether as many
+# lie on top as on level ground nearby: if not, the cell is the floor.
 
 # %%
 from fgtutor.scanning import ScanConfig, map_points
