@@ -100,14 +100,7 @@ class Trainer:
     def _make_env(self) -> LocomotionEnv:
         """Build this process's robots, on the CPU as their physics, on ground of its own."""
         seed = distributed.own_seed(self.config.seed)
-        config = replace(
-            self.config,
-            seed=seed,
-            device="cpu",
-            easiest=self.easiest,
-            easiest_at_last=None,
-            std_at_last=None,
-        )
+        config = replace(self.config, seed=seed, device="cpu", easiest=self.easiest)
         return make_training_env(config, self.iteration)
 
     def _start_from(self, folder: Path) -> None:

@@ -17,7 +17,7 @@ from fgtutor import mapping
 from fgtutor.cloudfiles import read_points, save_points
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import CloudError, ConfigError, MapError, StorageError
-from fgtutor.scanning import ScanConfig, map_points
+from fgtutor.scanning import WALL, ScanConfig, map_points
 
 
 def cloud(n: int = 200, seed: int = 0) -> np.ndarray:
@@ -232,9 +232,12 @@ def test_statistics_by_hand() -> None:
     st.integers(0, 10**6),
     st.sampled_from((0.05, 0.1, 0.02)),
     st.integers(1, 3),
+    st.sampled_from((-1.0, 0.25)),
 )
-def test_statistics_against_a_naive_loop(n: int, seed: int, step: float, least: int) -> None:
-    points = np.random.default_rng(seed).uniform((-0.2, 0.3, 0.25), (0.2, 0.5, 0.4), (n, 3))
+def test_statistics_against_a_naive_loop(
+    n: int, seed: int, step: float, least: int, low: float
+) -> None:
+    points = np.random.default_rng(seed).uniform((-0.2, 0.3, low), (0.2, 0.5, 0.4), (n, 3))
     points = np.concatenate((points, np.full((least, 3), 0.4)))  # one cell is surely known
     area = (-0.2, 0.3, 0.6, 0.6)
     config = ScanConfig(resolution=step, neighbours=0, min_points=least)
@@ -252,7 +255,10 @@ def test_statistics_against_a_naive_loop(n: int, seed: int, step: float, least: 
         found = (
             scanned.lowest[ix, iy],
             scanned.p95[ix, iy],
-            scanned.elevation.heights[ix, iy] if len(z) >= least else expected[2],
+            # What lies beside a wall is not the median: see the tests of chasms with the scanner.
+            scanned.elevation.heights[ix, iy]
+            if len(z) >= least and expected[1] - expected[0] <= WALL - 2e-4
+            else expected[2],
             scanned.variance[ix, iy],
         )
         assert found == pytest.approx(expected, abs=2e-4)  # heights are kept to 0.1 mm

@@ -36,7 +36,7 @@ from fgtutor.obstacles import SCALES, Course
 from fgtutor.pipeline import plan_on_map
 from fgtutor.planning import plan
 from fgtutor.routes import Route
-from fgtutor.specialist import ZOO, Specialist, load_zoo
+from fgtutor.specialist import ZOO, Specialist
 from fgtutor.tensorization import tensorize
 from fgtutor.terrain import Section, Terrain, rasterise
 
@@ -88,8 +88,9 @@ class AdaptationConfig(PlannedConfig):
 
     def load_checkpoints(self) -> dict[str, Specialist]:
         """Return the checkpoints by name, the least trained one first."""
-        zoo = load_zoo(self.robot, self.home, include_general=True)
-        return dict(sorted(zoo.items(), key=lambda item: item[1].provenance.get("samples", 0)))
+        return dict(
+            sorted(self.load_zoo().items(), key=lambda item: item[1].provenance.get("samples", 0))
+        )
 
     def seeds(self, index: int) -> tuple[int, ...]:
         """Return the seeds of the trials on one map: every n-th."""

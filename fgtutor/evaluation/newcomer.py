@@ -84,9 +84,8 @@ def terrains(config: NewcomerConfig) -> tuple[str, ...]:
         raise ConfigError(
             f"{config.name} is in the zoo already: leave it out by its name, not {config.newcomer}"
         )
-    its_own = config.terrain or config.load_zoo()[config.name].provenance.get(
-        "terrain", config.name
-    )
+    provenance = load_specialist(config.folder).provenance
+    its_own = config.terrain or provenance.get("terrain", config.name)
     return tuple(
         dict.fromkeys((its_own, *(config.others or (*SCALES[config.robot].mixed, "mixed"))))
     )
