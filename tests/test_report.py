@@ -9,7 +9,7 @@ import pytest
 
 from fgtutor.errors import ReportError
 from fgtutor.evaluation.chart import share_chart
-from fgtutor.evaluation.report import Share, markdown, write_report
+from fgtutor.evaluation.report import Findings, Share, markdown, write_report
 from fgtutor.evaluation.runner import Result
 from fgtutor.evaluation.shards import Run
 
@@ -26,12 +26,14 @@ def folder(tmp_path):
     write_report(
         tmp_path / "report",
         Run(tasks=2, results=results),
+        Findings(
+            table="| a |\n| --- |\n| 100 |",
+            caption="Three trials a cell.",
+            figures={"note.txt": lambda path: path.write_text("a figure")},
+        ),
         title="Success",
-        table="| a |\n| --- |\n| 100 |",
-        caption="Three trials a cell.",
         settings={"command": "evaluate matrix", "seed": 4},
         began=time.time() - 10,
-        figures={"note.txt": lambda path: path.write_text("a figure")},
     )
     return tmp_path / "report"
 

@@ -10,8 +10,6 @@ and against `geodesic`, the shortest way over cells that are no wall.
 """
 
 import json
-import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,13 +21,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fgtutor.errors import ConfigError, PlanningError, TerrainError
-from fgtutor.evaluation.cost import estimate
+from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.mapchart import draw_maps
 from fgtutor.evaluation.metrics import spl
 from fgtutor.evaluation.planned import PlannedConfig
-from fgtutor.evaluation.report import Share, markdown, write_report
+from fgtutor.evaluation.report import Draw, Findings, Share, markdown, run_and_report
 from fgtutor.evaluation.runner import Row, Task
-from fgtutor.evaluation.shards import collect, finished, settings_of
+from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.success import terrain_seed
 from fgtutor.execution import execute_batch
 from fgtutor.obstacles import SCALES, Course
@@ -312,54 +310,53 @@ def table(rows: Sequence[Row], zoo: Mapping[str, Specialist]) -> str:
 
 def run(config: AdaptationConfig) -> int:
     """Evaluate from the command line, print the table and write the report."""
-    began = time.time()
     zoo, tasks = config.load_checkpoints(), make_tasks(config)
     first = make_map(config.robot, terrain_seed(config.seed, 0), config.heights)
-    settings = settings_of(config, COMMAND, zoo=config.zoo_digests())
-    left = len(tasks) - len(finished(tasks, settings, config))
-    if left:
+
+    def cost() -> Cost:
         # The estimate takes the straight line for the length of a trial.
-        detour = fmean(LENGTHS) / STRAIGHT
-        trials = config.trials * len(zoo)
-        cost = estimate(zoo, [first], grounds=len(tasks), episodes=round(trials * detour))
-        cores = config.workers or os.cpu_count() or 1
-        cost = replace(cost, episodes=trials)
-        print(f"{left} of {len(tasks)} tasks to do; all of them: {cost.on(cores)}", flush=True)
-    done = collect(tasks, settings, config, progress=True)
-    if not done.complete:
-        print(f"{done}; give the other parts' folders to --merge for the table")
-        return 0
-    text = table(summaries(done.rows, list(zoo)), zoo)
-    caption = (
-        f"{config.trials:,} trials a checkpoint on {len(tasks)} maps, with 95 % intervals; robot "
-        f"{config.robot}, tau {config.taus}, f_min {config.f_min:g}, cost {config.cost}, "
-        f"seed {config.seed}. SPL against the straight line of {STRAIGHT:g} m, as the paper's "
-        f"numbers imply, and against the shortest way over no wall, {geodesic(first):.1f} m."
+        detour, trials = fmean(LENGTHS) / STRAIGHT, config.trials * len(zoo)
+        driven = estimate(zoo, [first], grounds=len(tasks), episodes=round(trials * detour))
+        return replace(driven, episodes=trials)
+
+    def find(trials: list[Row]) -> Findings:
+        return Findings(
+            table=table(summaries(trials, list(zoo)), zoo),
+            caption=(
+                f"{config.trials:,} trials a checkpoint on {len(tasks)} maps, with 95 % intervals; "
+                f"robot {config.robot}, tau {config.taus}, f_min {config.f_min:g}, "
+                f"cost {config.cost}, seed {config.seed}. SPL against the straight line of "
+                f"{STRAIGHT:g} m, as the paper's numbers imply, and against the shortest way over "
+                f"no wall, {geodesic(first):.1f} m."
+            ),
+            figures=figures(first, zoo, config) if config.out else {},
+        )
+
+    return run_and_report(
+        config,
+        title=f"Planning adapts to the policy ({config.robot})",
+        tasks=tasks,
+        settings=settings_of(config, COMMAND, zoo=config.zoo_digests()),
+        cost=cost,
+        find=find,
     )
-    print(f"{text}\n\n{caption}")
-    if config.out:
-        plans = find_plans(first, zoo, config)
-        picture = draw_maps(
-            first.elevation,
-            plans,
-            title="The better the policy, the shorter its route",
-            f_min=config.f_min,
-            walls=first.elevation.heights > WALL - 1e-3,
-            places=dict(zip(WAYS, first.sections, strict=True)),
-        )
-        stories = json.dumps({n: route and route.to_json() for n, (_, route) in plans.items()})
-        write_report(
-            config.out,
-            done,
-            title=f"Planning adapts to the policy ({config.robot})",
-            table=text,
-            caption=caption,
-            settings=settings,
-            began=began,
-            figures={
-                "maps.svg": lambda path: path.write_text(picture),
-                "routes.json": lambda path: path.write_text(stories),
-            },
-        )
-        print(f"report -> {config.out}")
-    return 0
+
+
+def figures(
+    first: Terrain, zoo: Mapping[str, Specialist], config: AdaptationConfig
+) -> dict[str, Draw]:
+    """Return a map with route a checkpoint, drawn and as numbers."""
+    plans = find_plans(first, zoo, config)
+    picture = draw_maps(
+        first.elevation,
+        plans,
+        title="The better the policy, the shorter its route",
+        f_min=config.f_min,
+        walls=first.elevation.heights > WALL - 1e-3,
+        places=dict(zip(WAYS, first.sections, strict=True)),
+    )
+    stories = json.dumps({name: route and route.to_json() for name, (_, route) in plans.items()})
+    return {
+        "maps.svg": partial(Path.write_text, data=picture),
+        "routes.json": partial(Path.write_text, data=stories),
+    }

@@ -9,19 +9,22 @@ Reads a finished run, its table and its figures; writes beside the shards (see `
 
 Another experiment needs four things. A function of a module that takes plain arguments and returns
 rows (`trials.drive` does the driving). Its tasks, `[Task(name=..., function=..., arguments=...)]`.
-A config that inherits `RunConfig`. And a `run` like `matrix.run`: `collect` the rows under
-`settings_of(config, ...)`, make a table of them (`markdown`, `Share`), and `write_report`.
+A config that inherits `RunConfig`. And a function that makes `Findings` of the rows (`markdown`,
+`Share`), for `run_and_report`.
 """
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
+from fgtutor.evaluation.cost import Cost
 from fgtutor.evaluation.metrics import wilson_interval
-from fgtutor.evaluation.shards import Run
+from fgtutor.evaluation.runner import Row, Task
+from fgtutor.evaluation.shards import Run, RunConfig, collect, finished
 from fgtutor.storage import atomic_write, make_folder, write_json
 
 TABLE, ROWS, RUN, FIGURES = "table.md", "rows.json", "run.json", "figures"
@@ -63,25 +66,66 @@ def markdown(columns: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in cells)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """What the rows of a finished run come to."""
+
+    table: str
+    """As Markdown."""
+    caption: str
+    """What the table's numbers are, and how they were got."""
+    figures: Mapping[str, Draw] = field(default_factory=dict)
+    """By the name of their file."""
+
+
+def run_and_report(
+    config: RunConfig,
+    *,
+    title: str,
+    tasks: Sequence[Task],
+    settings: dict[str, Any],
+    cost: Callable[[], Cost],
+    find: Callable[[list[Row]], Findings],
+) -> int:
+    """Say what an evaluation will cost, do what is left of it, print and keep what it found.
+
+    Returns the exit status of its command, 0. Raises what `collect` and `write_report` raise.
+    """
+    began = time.time()
+    left = len(tasks) - len(finished(tasks, settings, config))
+    if left:
+        # How many cores a cluster will give is not known before it does.
+        cores = 1 if config.ray else config.workers or os.cpu_count() or 1
+        print(f"{left} of {len(tasks)} tasks to do; all of them: {cost().on(cores)}", flush=True)
+    run = collect(tasks, settings, config, progress=True)
+    if not run.complete:
+        print(f"{run}; give the other parts' folders to --merge for the table")
+        return 0
+    found = find(run.rows)
+    print(f"{found.table}\n\n{found.caption}")
+    if config.out:
+        write_report(config.out, run, found, title=title, settings=settings, began=began)
+        print(f"report -> {config.out}")
+    return 0
+
+
 def write_report(
     folder: Path,
     run: Run,
+    found: Findings,
     *,
     title: str,
-    table: str,
-    caption: str,
     settings: Mapping[str, Any],
     began: float,
-    figures: Mapping[str, Draw] | None = None,
 ) -> None:
     """Write what a finished run found; `began` is the `time.time()` at which this command did.
 
     Raises `StorageError` if the system refuses.
     """
     rows = run.rows
-    caption = f"{caption} {len(rows):,} trials in all."
+    caption = f"{found.caption} {len(rows):,} trials in all."
     make_folder(folder / FIGURES)
-    for name, draw in (figures or {}).items():
+    for name, draw in found.figures.items():
         with atomic_write(folder / FIGURES / name) as path:
             draw(path)
     with atomic_write(folder / ROWS) as path:
@@ -99,4 +143,4 @@ def write_report(
     write_json(folder / RUN, provenance)
     # Last, since a folder with a table is a finished one.
     with atomic_write(folder / TABLE) as path:
-        path.write_text(f"# {title}\n\n{table}\n\n{caption}\n")
+        path.write_text(f"# {title}\n\n{found.table}\n\n{caption}\n")

@@ -5,11 +5,10 @@ Trial k of a terrain is the same ground, start and goal for all planners.
 Source: paper, Sec. IV-B: 40 tasks of 250 trials a terrain, failures by reason.
 """
 
-import os
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,13 +16,14 @@ import numpy as np
 
 from fgtutor.baselines import planners
 from fgtutor.errors import ConfigError, ReportError
+from fgtutor.evaluation import report
 from fgtutor.evaluation.chart import share_chart
-from fgtutor.evaluation.cost import estimate
+from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.metrics import wilson_interval
 from fgtutor.evaluation.planned import PlannedConfig
-from fgtutor.evaluation.report import Share, write_report
+from fgtutor.evaluation.report import Findings, Share
 from fgtutor.evaluation.runner import Row, Task
-from fgtutor.evaluation.shards import collect, finished, settings_of
+from fgtutor.evaluation.shards import collect, settings_of
 from fgtutor.evaluation.trials import Ground, drive
 from fgtutor.storage import check_writable, write_json
 from fgtutor.terrain import Terrain, make_terrain
@@ -204,57 +204,51 @@ def run_and_report(
 
     `work` is as in `make_tasks`; a `remark` on all trials ends the caption.
     """
-    began = time.time()
     if config.json:
         check_writable(config.json)
-    tasks = make_tasks(config, terrains, policies, work)
-    settings = _settings(config, command, terrains, policies)
-    left = len(tasks) - len(finished(tasks, settings, config))
-    if left:
-        cost = estimate(
+
+    def cost() -> Cost:
+        return estimate(
             config.load_zoo(),
             [make_ground(config, terrain, 0).terrain for terrain in terrains],
             grounds=config.grounds,
             episodes=config.count * len(policies),
         )
-        # How many cores a cluster will give is not known before it does.
-        cores = 1 if config.ray else config.workers or os.cpu_count() or 1
-        print(f"{left} of {len(tasks)} tasks to do; all of them: {cost.on(cores)}", flush=True)
-    run = collect(tasks, settings, config, progress=True)
-    if not run.complete:
-        print(f"{run}; give the other parts' folders to --merge for the table")
-        return 0
-    rows = _summaries(run.rows, terrains, policies)
-    text = table(run.rows)
-    caption = (
-        f"Success in % with 95 % intervals, {config.count:,} trials a cell; robot {config.robot}, "
-        f"protocol {config.protocol}, tau {config.taus}, cost {config.cost}, "
-        f"switch cost {config.switch_cost:g}, seed {config.seed}."
-    )
-    if remark:
-        caption = f"{caption} {remark(run.rows)}"
-    print(f"{text}\n\n{caption}")
-    if config.json:
-        write_json(config.json, rows)
-        print(f"rows -> {config.json}")
-    if config.out:
-        groups: dict[str, dict[str, Share]] = {}
-        for row in rows:
-            share = Share(successes=row["successes"], trials=row["trials"])
-            groups.setdefault(row["terrain"], {})[row["policy"]] = share
-        chart = share_chart(groups, title)
-        write_report(
-            config.out,
-            run,
-            title=title,
-            table=text,
-            caption=caption,
-            settings=settings,
-            began=began,
-            figures={"success.svg": lambda path: path.write_text(chart)},
+
+    def find(trials: list[Row]) -> Findings:
+        rows = _summaries(trials, terrains, policies)
+        if config.json:
+            write_json(config.json, rows)
+            print(f"rows -> {config.json}")
+        caption = (
+            f"Success in % with 95 % intervals, {config.count:,} trials a cell; robot "
+            f"{config.robot}, protocol {config.protocol}, tau {config.taus}, cost {config.cost}, "
+            f"switch cost {config.switch_cost:g}, seed {config.seed}."
         )
-        print(f"report -> {config.out}")
-    return 0
+        chart = share_chart(_shares(rows), title)
+        return Findings(
+            table=table(trials),
+            caption=f"{caption} {remark(trials)}" if remark else caption,
+            figures={"success.svg": partial(Path.write_text, data=chart)},
+        )
+
+    return report.run_and_report(
+        config,
+        title=title,
+        tasks=make_tasks(config, terrains, policies, work),
+        settings=_settings(config, command, terrains, policies),
+        cost=cost,
+        find=find,
+    )
+
+
+def _shares(rows: Sequence[Row]) -> dict[str, dict[str, Share]]:
+    """Return the rows' shares by terrain and policy."""
+    groups: dict[str, dict[str, Share]] = {}
+    for row in rows:
+        share = Share(successes=row["successes"], trials=row["trials"])
+        groups.setdefault(row["terrain"], {})[row["policy"]] = share
+    return groups
 
 
 def _settings(

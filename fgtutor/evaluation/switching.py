@@ -7,7 +7,6 @@ level and planner. Source: paper, Sec. V (Table III: 20 attempts each with a rea
 simulation is not); it names imprecise localisation and free switching as what failures came from.
 """
 
-import os
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -24,11 +23,11 @@ from fgtutor.baselines import OURS, Planner, View, find_route, ours, single
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, PlanningError, TerrainError
 from fgtutor.evaluation.chart import share_chart
-from fgtutor.evaluation.cost import estimate
+from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.planned import PlannedConfig
-from fgtutor.evaluation.report import Draw, Share, markdown, write_report
+from fgtutor.evaluation.report import Draw, Findings, Share, markdown, run_and_report
 from fgtutor.evaluation.runner import Row, Task
-from fgtutor.evaluation.shards import collect, finished, settings_of
+from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.success import GROUNDS, terrain_seed
 from fgtutor.execution import FollowConfig, execute_batch
 from fgtutor.obstacles import OBSTACLES, SCALES, Course
@@ -333,49 +332,37 @@ def charts(trials: Sequence[Row]) -> dict[str, Draw]:
 
 def run(config: SwitchingConfig) -> int:
     """Evaluate from the command line, print the table and write the report."""
-    began = time.time()
-    zoo, tasks = config.load_zoo(), make_tasks(config)
+    zoo = config.load_zoo()
     planners = variants(config, zoo)
-    settings = settings_of(config, COMMAND, zoo=config.zoo_digests())
-    left = len(tasks) - len(finished(tasks, settings, config))
-    if left:
+
+    def cost() -> Cost:
         grounds = [lay_course(kinds, robot=config.robot) for kinds in courses(config).values()]
-        cost = estimate(
-            zoo,
-            grounds,
-            grounds=config.trials,
-            episodes=config.trials * len(planners) * len(config.levels),
+        episodes = config.trials * len(planners) * len(config.levels)
+        driven = estimate(zoo, grounds, grounds=config.trials, episodes=episodes)
+        scanned = config.trials * _scan_seconds(grounds, config.scan_spacing)
+        return replace(driven, seconds=driven.seconds + scanned)
+
+    def find(trials: list[Row]) -> Findings:
+        return Findings(
+            table=table(trials),
+            caption=(
+                f"Success in % with 95 % intervals, {config.trials:,} trials a cell; fixes with a "
+                "standard deviation of noise (cm) and a drift (cm per root second), maps from a "
+                f"simulated scan; robot {config.robot}, tau {config.taus}, cost {config.cost}, "
+                f"f_min {config.f_min:g}, switch cost {config.switch_cost:g}, hysteresis of "
+                f"{config.hold_steps} steps, seed {config.seed}."
+            ),
+            figures=charts(trials),
         )
-        seconds = cost.seconds + config.trials * _scan_seconds(grounds, config.scan_spacing)
-        cores = config.workers or os.cpu_count() or 1
-        says = replace(cost, seconds=seconds).on(cores)
-        print(f"{left} of {len(tasks)} tasks to do; all of them: {says}", flush=True)
-    done = collect(tasks, settings, config, progress=True)
-    if not done.complete:
-        print(f"{done}; give the other parts' folders to --merge for the table")
-        return 0
-    text = table(done.rows)
-    caption = (
-        f"Success in % with 95 % intervals, {config.trials:,} trials a cell; fixes with a standard "
-        "deviation of noise (cm) and a drift (cm per root second), maps from a simulated scan; "
-        f"robot {config.robot}, tau {config.taus}, cost {config.cost}, f_min {config.f_min:g}, "
-        f"switch cost {config.switch_cost:g}, hysteresis of {config.hold_steps} steps, "
-        f"seed {config.seed}."
+
+    return run_and_report(
+        config,
+        title=f"From terrain to terrain ({config.robot})",
+        tasks=make_tasks(config),
+        settings=settings_of(config, COMMAND, zoo=config.zoo_digests()),
+        cost=cost,
+        find=find,
     )
-    print(f"{text}\n\n{caption}")
-    if config.out:
-        write_report(
-            config.out,
-            done,
-            title=f"From terrain to terrain ({config.robot})",
-            table=text,
-            caption=caption,
-            settings=settings,
-            began=began,
-            figures=charts(done.rows),
-        )
-        print(f"report -> {config.out}")
-    return 0
 
 
 def _scan_seconds(grounds: Sequence[Terrain], spacing: float) -> float:
