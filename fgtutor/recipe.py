@@ -34,7 +34,7 @@ class TrainConfig:
     out: Path | None = None
     """Run folder for checkpoints, curves and the specialist; default runs/ROBOT-TERRAIN."""
     resume: bool = False
-    """Continue from the run folder's checkpoint."""
+    """Continue from the run folder's checkpoint; with more `iterations`, beyond its end."""
     start_from: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Specialist folder whose policy to start from, such as a walker's, or a run's folder, whose
     critic and, on the same terrain, Feasibility-Net come along (to go on where it is harder);
@@ -45,7 +45,7 @@ class TrainConfig:
     hours: float = 0.0
     """Stop and save after this many hours; --resume goes on. 0 sets no limit."""
     iterations: int = 200
-    """PPO iterations in all."""
+    """PPO iterations in all, over which entropy and the Feasibility-Net's learning rate fall."""
     num_envs: int = 128
     """Robots simulated side by side (by each process)."""
     steps: int = 40

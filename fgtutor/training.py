@@ -209,6 +209,8 @@ class Trainer:
         state = {
             "config": json.dumps(comparable(self.config)),
             "iteration": self.iteration,
+            "samples_before": self.samples_before,
+            "critic_warmup": self.critic_warmup,
             "easiest": self.easiest,
             "seconds": self.seconds,
             "history": json.dumps(self.history),
@@ -230,18 +232,21 @@ class Trainer:
         _give_back_memory()
 
     def resume(self) -> None:
-        """Continue from the run folder's checkpoint.
+        """Continue from the run folder's checkpoint, to more iterations if `config` says so.
 
-        Raises `CheckpointError` if there is none, it cannot be read, or it is of another run.
+        What the run once started from need not be given again, nor still be there. Raises
+        `CheckpointError` if there is no checkpoint, it cannot be read, or it is of another run.
         """
         path = self.checkpoint
         if not path.exists():
             raise CheckpointError(f"no checkpoint at {path}: start without --resume")
         state = _read(path)
-        mine = comparable(self.config)
         # A setting younger than the checkpoint had what is now its default.
         stored = comparable(type(self.config)()) | state["config"]
-        changed = sorted(k for k in mine if stored.get(k) != mine[k])
+        if stored["start_from"] and not self.config.start_from:
+            self.config = replace(self.config, start_from=Path(stored["start_from"]))
+        mine = comparable(self.config)
+        changed = sorted(k for k in mine if k != "iterations" and stored.get(k) != mine[k])
         if changed:
             what = ", ".join(f"{k} was {stored.get(k)!r}, now {mine[k]!r}" for k in changed)
             raise CheckpointError(
@@ -255,6 +260,8 @@ class Trainer:
             )
         own = everyone[distributed.rank()]
         self.algorithm.load(state["algorithm"])
+        self.samples_before = state.get("samples_before", self.samples_before)
+        self.critic_warmup = state.get("critic_warmup", self.critic_warmup)
         warm = state["iteration"] < self.critic_warmup
         self.algorithm.get_policy().requires_grad_(not warm)
         self.iteration, self.seconds = state["iteration"], state["seconds"]

@@ -224,6 +224,26 @@ def test_from_a_run_its_critic_and_net_come_along_and_nothing_warms_up(trained, 
     assert any(not torch.equal(v, policy.state_dict()[k]) for k, v in first.items())
 
 
+def test_a_resumed_run_knows_what_it_started_from_and_goes_on_beyond_its_end(trained, tmp_path):
+    start = shutil.copytree(trained[0].folder / "specialist", tmp_path / "start")
+    settings = TINY | {"iterations": 1, "critic_warmup": 2, "warm_std": 0.125}
+    first = train(TrainConfig(out=tmp_path / "run", start_from=start, **settings))
+    shutil.rmtree(start)
+    settings |= {"iterations": 3, "out": tmp_path / "run", "resume": True}
+    trainer = Trainer(TrainConfig(**settings))
+    trainer.resume()
+    policy = trainer.algorithm.get_policy()
+    assert trainer.config.start_from == start and not next(policy.parameters()).requires_grad
+    assert trainer.samples == first.provenance["samples"]
+    assert trainer.iterate()["samples"] == first.provenance["samples"] + 4 * 8
+    went_on = train(TrainConfig(**settings))
+    assert went_on.provenance["samples"] == first.provenance["samples"] + 2 * 4 * 8
+    assert went_on.provenance["config"]["start_from"] == str(start)
+    with pytest.raises(CheckpointError, match=r"start_from was '.*start', now '.*other'"):
+        other = shutil.copytree(trained[0].folder / "specialist", tmp_path / "other")
+        train(TrainConfig(**settings, start_from=other))
+
+
 @pytest.mark.parametrize("part", ["", "specialist", "snapshots/25"])
 def test_a_run_does_not_overwrite_what_it_starts_from(tmp_path, part):
     with pytest.raises(ConfigError, match=r"would be overwritten .* give another --out"):
