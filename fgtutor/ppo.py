@@ -29,26 +29,26 @@ def feasibility_labels(
     `tracking[t]` holds (r_v, failed, ended) of the step that led to time t. A failure makes
     the rest of its window zero; a time-out cuts it short; no label reaches into the next episode.
     A label counts if at least half of its window was seen. `window` 0 means 1, the paper's label.
+
+    `failed` between 0 and 1 is a failure that reaches back over that share of the window only: who
+    is further away from it does not know of it, as with a time-out.
     """
     window = max(window, 1)
     steps = tracking.shape[0]
     total = torch.zeros_like(tracking[..., 0])
     seen = torch.zeros_like(total)
     running = torch.ones_like(total, dtype=torch.bool)
-    failed_before = torch.zeros_like(running)
-    for ahead in range(1, window + 1):
-        # Steps of a failed episode that never happened still count, as zeros.
-        seen += failed_before
-        if ahead >= steps:
-            continue
+    reach = torch.zeros_like(total)
+    for ahead in range(1, min(window, steps - 1) + 1):
         r_v, failed, ended = tracking[ahead:].unbind(-1)
         now = running[:-ahead]
         total[:-ahead] += r_v * now
         seen[:-ahead] += now
-        failed_before[:-ahead] |= now & (failed > 0)
+        reach[:-ahead] += window * failed * now
         running[:-ahead] = now & (ended == 0)
         running[-ahead:] = False
-    return total / seen.clamp(min=1), seen >= (window + 1) // 2
+    # Steps of a failed episode that never happened still count, as zeros.
+    return total / seen.maximum(reach).clamp(min=1), (seen >= (window + 1) // 2) | (reach > 0)
 
 
 class FeasibilityPPO(PPO):
@@ -94,11 +94,11 @@ class FeasibilityPPO(PPO):
 
         The context encoder comes last: what PPO compares are policies on the same context.
         """
-        tracking = self.storage.observations["tracking"]
+        r_v, failed, ended = self.storage.observations["tracking"].unbind(-1)
         self.metrics = {
             "reward": self.storage.rewards.mean().item(),
-            "r_v": tracking[..., 0].mean().item(),
-            "failed": tracking[..., 1].sum().item() / max(1.0, tracking[..., 2].sum().item()),
+            "r_v": r_v.mean().item(),
+            "failed": (failed == 1).sum().item() / max(1.0, ended.sum().item()),
         }
         self.metrics |= self.fit_feasibility()
         samples = self.context.samples(self.storage.observations) if self.context else None

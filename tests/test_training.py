@@ -61,6 +61,16 @@ def test_a_failure_counts_even_if_the_rollout_ends_soon_after():
     assert label[0, 0] == pytest.approx(0.08) and valid[0, 0]
 
 
+def test_a_partial_failure_reaches_back_over_its_share_of_the_window_only():
+    label, valid = feasibility_labels(
+        tracking((9, 0, 0), *[(0.8, 0, 0)] * 4, (0.8, 0.25, 1), (1, 0, 0)), 8
+    )
+    # Five steps away it cuts the window short, and still does two away; there, with one left of
+    # the two that it reaches back over, the other one is zero.
+    assert label[:5, 0].tolist() == pytest.approx([0.8, 0.8, 0.8, 0.8, 0.4])
+    assert valid[:5].all()
+
+
 def test_a_time_out_cuts_the_window_without_zeros():
     label, valid = feasibility_labels(
         tracking((9, 0, 0), (0.6, 0, 0), (0.8, 0, 1), (0.1, 0, 0), (0.1, 0, 0)), 4

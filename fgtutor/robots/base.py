@@ -45,13 +45,18 @@ def plain_tensors(method: Callable[..., Any]) -> Callable[..., Any]:
     return torch.inference_mode(False)(torch.no_grad()(method))
 
 
+UNTRIED = 1 / 3
+"""How far back it counts as a failure to go on to another's obstacle, as a share of the label's
+window. Over the whole of it, no policy would be feasible where one must hand over to the next."""
+
+
 class LocomotionEnv(VecEnv):
     """A batch of robots on a `World`, with observation groups {policy, patch, command, tracking}.
 
     The `tracking` group holds, for the step just taken, (r_v, failed, ended): r_v is 0 once a robot
     has failed, so a fall can never look feasible; nor can what is never tried: whoever goes on to
-    another's obstacle has failed there. If asked for, `history` holds the last frames of
-    what a blind robot feels and `critic` all that the simulation knows: true velocity, then policy.
+    another's obstacle has failed there, by `UNTRIED`. If asked for, `history` holds the last frames
+    of what a blind robot feels and `critic` all that the simulation knows: true velocity, policy.
     """
 
     grid: PatchGrid
@@ -191,7 +196,8 @@ class LocomotionEnv(VecEnv):
         outside, strange = self._outside(pose)
         truncated = (self.episode_length_buf >= self.max_episode_length) | outside
         done = failed | truncated
-        self.tracking = torch.stack((r_v, (failed | strange).float(), done.float()), dim=-1)
+        lost = failed.float().maximum(UNTRIED * strange)
+        self.tracking = torch.stack((r_v, lost, done.float()), dim=-1)
         extras = {"time_outs": (truncated & ~failed).float(), "fell": fell}
         if self.config.train:
             ids = done.nonzero().flatten()
