@@ -1,18 +1,26 @@
-"""Write a table into the README from a report folder, with the number of trials it stands on.
+"""Write a table into the README from report folders, with the number of trials it stands on.
 
-Reads a folder that a `fgtutor evaluate` command has finished; replaces what stands between
-`<!-- table NAME -->` and `<!-- end NAME -->`.
-Use: python benchmarks/readme_table.py FOLDER NAME [README.md]
+Reads folders that a `fgtutor evaluate` command has finished; replaces what stands between
+`<!-- table NAME -->` and `<!-- end NAME -->`. Folders of other policies or planners, all else being
+equal, join the first one's table: a specialist that has changed need not wait for the others again.
+Use: python benchmarks/readme_table.py NAME FOLDER [FOLDER ...]
 """
 
 import json
 import re
 import sys
+from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
+from typing import Any
 
 from fgtutor.errors import ReportError
 from fgtutor.evaluation.report import ROWS, RUN, TABLE
 from fgtutor.storage import atomic_write
+
+README = Path("README.md")
+FREE = {"policies", "planners", "zoo"}
+"""Settings in which folders of one table may differ."""
 
 
 def fill(text: str, name: str, block: str) -> str:
@@ -24,30 +32,61 @@ def fill(text: str, name: str, block: str) -> str:
     return pattern.sub(lambda _: f"{begin}\n{block}\n{end}", text)
 
 
-def block_of(folder: Path) -> str:
-    """Return table and caption of a report folder, with its trials counted and its date."""
-    try:
-        table = (folder / TABLE).read_text().split("\n", 2)[2].strip()
-        trials = len(json.loads((folder / ROWS).read_bytes()))
-        run = json.loads((folder / RUN).read_bytes())
-        date, command = run["finished"][:10], run["settings"]["command"]
-    except (OSError, ValueError, LookupError) as error:
-        raise ReportError(
-            f"{folder} holds no finished report ({error}): run the command with --out to its end"
-        ) from error
-    return f"{table}\n\n*{trials:,} trials of `fgtutor {command}`, {date}.*"
+def block_of(folders: Sequence[Path]) -> str:
+    """Return the table of report folders and its caption, with all trials counted and the date."""
+    tables, captions, runs, trials = [], [], [], 0
+    for folder in folders:
+        try:
+            _, table, caption = (folder / TABLE).read_text().strip().split("\n\n")
+            trials += len(json.loads((folder / ROWS).read_bytes()))
+            runs.append(json.loads((folder / RUN).read_bytes()))
+        except (OSError, ValueError) as error:
+            raise ReportError(
+                f"{folder} holds no finished report ({error}): run the command with --out to its "
+                "end"
+            ) from error
+        tables.append([line.strip("| ").split(" | ") for line in table.splitlines()])
+        captions.append(re.sub(r" [\d,]+ trials in all\.$", "", caption))
+    settings = [run["settings"] for run in runs]
+    _check(settings)
+    lines = ["| " + " | ".join(line) + " |" for line in reduce(join, tables)]
+    date, command = max(run["finished"] for run in runs)[:10], settings[0]["command"]
+    return "\n".join(
+        [*lines, "", captions[0], "", f"*{trials:,} trials of `fgtutor {command}`, {date}.*"]
+    )
 
 
-def main(arguments: list[str]) -> None:
-    folder, name, *rest = arguments
-    readme = Path(rest[0] if rest else "README.md")
-    text = fill(readme.read_text(), name, block_of(Path(folder)))
-    with atomic_write(readme) as path:
+def join(one: list[list[str]], other: list[list[str]]) -> list[list[str]]:
+    """Return two tables as one: below each other if their heads are the same, else side by side."""
+    if one[0] == other[0]:
+        return one + other[2:]
+    if [line[0] for line in one] == [line[0] for line in other]:
+        return [mine + theirs[1:] for mine, theirs in zip(one, other, strict=True)]
+    raise ReportError("the folders' tables share neither their lines nor their columns")
+
+
+def _check(settings: Sequence[dict[str, Any]]) -> None:
+    """Raise `ReportError` unless all differ in whom they measured only."""
+    first = settings[0]
+    for later in settings[1:]:
+        changed = {
+            name for name in first.keys() | later.keys() if first.get(name) != later.get(name)
+        }
+        zoos = first.get("zoo", {}), later.get("zoo", {})
+        retrained = {name for name in zoos[0].keys() & zoos[1] if zoos[0][name] != zoos[1][name]}
+        if wrong := (changed - FREE) | retrained:
+            raise ReportError(f"the folders differ in {', '.join(sorted(wrong))}: not one table")
+
+
+def main(arguments: Sequence[str]) -> None:
+    name, *folders = arguments
+    text = fill(README.read_text(), name, block_of([Path(folder) for folder in folders]))
+    with atomic_write(README) as path:
         path.write_text(text)
 
 
 if __name__ == "__main__":
-    if len(sys.argv) not in (3, 4):
+    if len(sys.argv) < 3:
         sys.exit(__doc__)
     try:
         main(sys.argv[1:])

@@ -1,6 +1,7 @@
 import importlib.util
 import json
 import re
+import shutil
 import time
 from pathlib import Path
 from xml.etree import ElementTree
@@ -91,32 +92,79 @@ def test_the_chart_draws_every_share_where_it_lies():
 
 
 @pytest.fixture
-def fill():
+def readme(tmp_path):
+    path = tmp_path / "README.md"
+    path.write_text("before\n<!-- table matrix -->\nold\n<!-- end matrix -->\nafter\n")
+    return path
+
+
+@pytest.fixture
+def fill(readme, monkeypatch):
     spec = importlib.util.spec_from_file_location("readme_table", SCRIPT)
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
+    monkeypatch.setattr(script, "README", readme)
     return lambda *arguments: script.main([str(argument) for argument in arguments])
 
 
-def test_the_script_writes_the_table_between_its_markers(fill, folder, tmp_path):
-    readme = tmp_path / "README.md"
-    readme.write_text("before\n<!-- table matrix -->\nold\n<!-- end matrix -->\nafter\n")
+def another(folder, *, table, **settings):
+    """Return a copy of a report folder with another table and some other settings."""
+    path = shutil.copytree(folder, folder.parent / f"report-{len(list(folder.parent.iterdir()))}")
+    text = (path / "table.md").read_text()
+    (path / "table.md").write_text(text.replace("| a |\n| --- |\n| 100 |", table))
+    run = json.loads((path / "run.json").read_text())
+    run["settings"] |= settings
+    (path / "run.json").write_text(json.dumps(run))
+    return path
+
+
+def test_the_script_writes_the_table_between_its_markers(fill, folder, readme):
     date = json.loads((folder / "run.json").read_text())["finished"][:10]
     for _ in range(2):  # the second time changes nothing
-        fill(folder, "matrix", readme)
+        fill("matrix", folder)
         assert readme.read_text() == (
-            "before\n<!-- table matrix -->\n| a |\n| --- |\n| 100 |\n\n"
-            "Three trials a cell. 3 trials in all.\n\n"
+            "before\n<!-- table matrix -->\n| a |\n| --- |\n| 100 |\n\nThree trials a cell.\n\n"
             f"*3 trials of `fgtutor evaluate matrix`, {date}.*\n<!-- end matrix -->\nafter\n"
         )
 
 
-def test_the_script_refuses_what_is_not_finished_or_not_marked(fill, folder, tmp_path):
-    readme = tmp_path / "README.md"
+def test_folders_of_other_policies_join_the_table(fill, folder, readme):
+    head = "| terrain | {} |\n| --- | --- |\n"
+    steps = another(folder, table=head.format("ours") + "| steps | 99 |", zoo={"steps": "ab"})
+    right = another(folder, table=head.format("general") + "| steps | 8 |", policies=["general"])
+    below = another(folder, table=head.format("ours") + "| gaps | 97 |", zoo={"gaps": "cd"})
+    fill("matrix", steps, right)
+    assert (
+        "| terrain | ours | general |\n| --- | --- | --- |\n| steps | 99 | 8 |\n\n"
+    ) in readme.read_text()
+    assert "*6 trials of" in readme.read_text()
+    fill("matrix", steps, below)
+    assert head.format("ours") + "| steps | 99 |\n| gaps | 97 |\n\n" in readme.read_text()
+
+
+@pytest.mark.parametrize(
+    ("table", "settings", "words"),
+    [
+        ("| a |\n| --- |\n| 100 |", {"seed": 5}, "differ in seed"),
+        ("| a |\n| --- |\n| 100 |", {"zoo": {"steps": "cd"}}, "differ in steps"),
+        ("| b |\n| --- |\n| 7 |", {}, "neither"),
+    ],
+)
+def test_folders_that_are_not_of_one_table_do_not_join(
+    fill, folder, readme, table, settings, words
+):
+    before = readme.read_text()
+    mine = another(folder, table="| a |\n| --- |\n| 100 |", zoo={"steps": "ab"})
+    with pytest.raises(ReportError, match=words):
+        fill("matrix", mine, another(folder, table=table, **settings))
+    assert readme.read_text() == before
+
+
+def test_the_script_refuses_what_is_not_finished_or_not_marked(fill, folder, readme):
     readme.write_text("no markers")
     with pytest.raises(ReportError, match="<!-- table matrix -->"):
-        fill(folder, "matrix", readme)
+        fill("matrix", folder)
     (folder / "table.md").unlink()
     with pytest.raises(ReportError, match="no finished report"):
-        fill(folder, "matrix", readme)
+        fill("matrix", folder)
     assert readme.read_text() == "no markers"
