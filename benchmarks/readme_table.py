@@ -47,6 +47,8 @@ def block_of(folders: Sequence[Path]) -> str:
             ) from error
         tables.append([line.strip("| ").split(" | ") for line in table.splitlines()])
         captions.append(re.sub(r" [\d,]+ trials in all\.$", "", caption))
+    if len(set(captions)) > 1:  # which say how many trials a cell has, and how they were driven
+        raise ReportError("the folders are not of one table: " + " / ".join(captions))
     settings = [run["settings"] for run in runs]
     _check(settings)
     lines = ["| " + " | ".join(line) + " |" for line in reduce(join, tables)]

@@ -85,6 +85,24 @@ def test_parts_merge_to_the_same_table(config, monkeypatch):
         evaluate(merged)
 
 
+@pytest.mark.slow
+def test_more_trials_in_the_same_folder_drive_only_the_new_ones(config, monkeypatch):
+    monkeypatch.setattr(success, "GROUNDS", 2)
+    few = replace(config, terrains=("flat",), policies=("steps",), out=config.zoo.parent / "few")
+    evaluate(few)
+    more = replace(few, trials=5)
+    whole = evaluate(replace(more, out=None))
+    drawn, make = [], success.make_ground
+    monkeypatch.setattr(success, "make_ground", lambda *w: drawn.append(w[-1]) or make(*w))
+    assert evaluate(more) == whole and whole[0]["trials"] == 5
+    assert drawn == [2, 3, 4]  # of the second task only one ground was there
+    assert evaluate(few)[0]["trials"] == 3 and drawn == [2, 3, 4]
+    # By the paper's protocol, a ground stands for every 40th of the trials.
+    evaluate(replace(few, protocol="paper", out=config.zoo.parent / "paper"))
+    with pytest.raises(ReportError, match="trials was 3 and is 5"):
+        evaluate(replace(more, protocol="paper", out=config.zoo.parent / "paper"))
+
+
 def test_the_command_writes_rows_and_a_report_and_prints_a_table(config, capsys):
     folder = config.zoo.parent / "report"
     config = replace(config, terrains=("flat",), out=folder)

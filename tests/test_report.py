@@ -107,11 +107,12 @@ def fill(readme, monkeypatch):
     return lambda *arguments: script.main([str(argument) for argument in arguments])
 
 
-def another(folder, *, table, **settings):
+def another(folder, *, table, caption="Three", **settings):
     """Return a copy of a report folder with another table and some other settings."""
     path = shutil.copytree(folder, folder.parent / f"report-{len(list(folder.parent.iterdir()))}")
     text = (path / "table.md").read_text()
-    (path / "table.md").write_text(text.replace("| a |\n| --- |\n| 100 |", table))
+    text = text.replace("| a |\n| --- |\n| 100 |", table).replace("Three", caption)
+    (path / "table.md").write_text(text)
     run = json.loads((path / "run.json").read_text())
     run["settings"] |= settings
     (path / "run.json").write_text(json.dumps(run))
@@ -148,6 +149,7 @@ def test_folders_of_other_policies_join_the_table(fill, folder, readme):
         ("| a |\n| --- |\n| 100 |", {"seed": 5}, "differ in seed"),
         ("| a |\n| --- |\n| 100 |", {"zoo": {"steps": "cd"}}, "differ in steps"),
         ("| b |\n| --- |\n| 7 |", {}, "neither"),
+        ("| a |\n| --- |\n| 100 |", {"caption": "Four"}, "Three trials a cell. / Four trials"),
     ],
 )
 def test_folders_that_are_not_of_one_table_do_not_join(

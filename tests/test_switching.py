@@ -217,7 +217,8 @@ def test_the_table_and_the_charts_by_hand(tmp_path):
 
 def test_tasks_are_cut_by_trials_only(monkeypatch):
     tasks = switching.make_tasks(SwitchingConfig(trials=60, courses=("full",)))
-    assert [task.name for task in tasks] == ["full-00000", "full-00025", "full-00050"]
+    names = ["full-00000-00025", "full-00025-00050", "full-00050-00060"]
+    assert [task.name for task in tasks] == names
     assert [list(task.arguments[2])[-1] for task in tasks] == [24, 49, 59]
     assert len(switching.make_tasks(SwitchingConfig(robot="a1", trials=200))) == 6 * 8
 

@@ -12,7 +12,7 @@ then the same command with `--merge FOLDER FOLDER` has all shards and writes the
 
 import dataclasses
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -86,12 +86,16 @@ class Run:
         return f"{len(self.results)} of {self.tasks} tasks done, in {self.seconds / 3600:.2f} h"
 
 
-def settings_of(config: RunConfig, command: str, **more: Any) -> dict[str, Any]:
+def settings_of(
+    config: RunConfig, command: str, *, without: Collection[str] = (), **more: Any
+) -> dict[str, Any]:
     """Return what the rows of a command depend on: its config but for the run's own fields, `more`.
 
     Where the zoo lies is left out, since machines may differ in it: give digests of it instead.
+    `without` names other fields that change no row: where every trial has a ground of its own, a
+    folder of 100 trials is the beginning of one of 200.
     """
-    own = {field.name for field in dataclasses.fields(RunConfig)} | {"json", "zoo"}
+    own = {field.name for field in dataclasses.fields(RunConfig)} | {"json", "zoo", *without}
     fields = {name: value for name, value in asdict(config).items() if name not in own}
     settings = {"command": command, "fgtutor": __version__, **fields, **more}
     return json.loads(json.dumps(settings, default=str))  # as a file gives it back

@@ -6,7 +6,7 @@ Source: paper, Sec. IV-B: 40 tasks of 250 trials a terrain, failures by reason.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -41,7 +41,8 @@ class TrialsConfig(PlannedConfig):
     """What success rates are measured on."""
 
     trials: int | None = None
-    """Trials per policy and terrain; default: 50, for the paper's protocol its 10,000."""
+    """Trials per policy and terrain; default: 50, for the paper's protocol its 10,000. With more
+    of them in the same folder, only the new ones are driven, but for the paper's protocol."""
     protocol: Literal["grounds", "paper"] = "grounds"
     """"grounds" crosses a new ground in each trial; "paper" draws 40 grounds with a start and a
     goal each (mixed: its own) and crosses each 250 times."""
@@ -123,13 +124,19 @@ def make_tasks(
     size = 1 if config.protocol == "paper" else GROUNDS
     return [
         Task(
-            name=f"{terrain}-{first:05d}",
+            name=f"{terrain}-{grounds.start:05d}-{grounds.stop:05d}",
             function=work or run_task,
-            arguments=(config, terrain, tuple(policies), range(config.grounds)[first:][:size]),
+            arguments=(config, terrain, tuple(policies), grounds),
         )
         for terrain in terrains
-        for first in range(0, config.grounds, size)
+        for grounds in cut(config.grounds, size)
     ]
+
+
+def cut(count: int, size: int = GROUNDS) -> Iterator[range]:
+    """Cut `count` grounds into tasks of `size`; a greater count only adds tasks, or fills one."""
+    for first in range(0, count, size):
+        yield range(first, min(first + size, count))
 
 
 def run_task(
@@ -254,13 +261,16 @@ def _shares(rows: Sequence[Row]) -> dict[str, dict[str, Share]]:
 def _settings(
     config: TrialsConfig, command: str, terrains: Sequence[str], policies: Sequence[str]
 ) -> dict[str, Any]:
+    # By the paper's protocol, their number says which trials a ground is for.
+    number = {"trials": config.count} if config.protocol == "paper" else {}
     return settings_of(
         config,
         command,
+        without=("trials",),
         terrains=terrains,
         policies=policies,
-        trials=config.count,
         zoo=config.zoo_digests(),
+        **number,
     )
 
 

@@ -28,7 +28,7 @@ from fgtutor.evaluation.planned import PlannedConfig
 from fgtutor.evaluation.report import Draw, Findings, Share, markdown, run_and_report
 from fgtutor.evaluation.runner import Row, Task
 from fgtutor.evaluation.shards import settings_of
-from fgtutor.evaluation.success import GROUNDS, terrain_seed
+from fgtutor.evaluation.success import cut, terrain_seed
 from fgtutor.execution import FollowConfig, execute_batch
 from fgtutor.obstacles import OBSTACLES, SCALES, Course
 from fgtutor.robots.lidar import scan_terrain, survey
@@ -57,7 +57,8 @@ class SwitchingConfig(PlannedConfig):
     """Drive from terrain to terrain on scanned maps, the paper's Table III."""
 
     trials: int = 50
-    """Trials per course, planner and level of noise, each on a ground of its own."""
+    """Trials per course, planner and level of noise, each on a ground of its own. With more of
+    them in the same folder, only the new ones are driven."""
     levels: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.03, 0.0), (0.03, 0.01), (0.06, 0.02))
     """Localisation errors: standard deviation of each fix, m, and its drift, m per square root of a
     second."""
@@ -187,12 +188,12 @@ def make_tasks(config: SwitchingConfig) -> list[Task]:
     """Cut the evaluation into tasks: some grounds of one course, all planners and levels."""
     return [
         Task(
-            name=f"{course}-{first:05d}",
+            name=f"{course}-{grounds.start:05d}-{grounds.stop:05d}",
             function=run_task,
-            arguments=(config, course, range(config.trials)[first:][:GROUNDS]),
+            arguments=(config, course, grounds),
         )
         for course in courses(config)
-        for first in range(0, config.trials, GROUNDS)
+        for grounds in cut(config.trials)
     ]
 
 
@@ -359,7 +360,7 @@ def run(config: SwitchingConfig) -> int:
         config,
         title=f"From terrain to terrain ({config.robot})",
         tasks=make_tasks(config),
-        settings=settings_of(config, COMMAND, zoo=config.zoo_digests()),
+        settings=settings_of(config, COMMAND, without=("trials",), zoo=config.zoo_digests()),
         cost=cost,
         find=find,
     )
