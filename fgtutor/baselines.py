@@ -174,8 +174,12 @@ class View:
 
     def assessment(self, name: str) -> Assessment:
         """Return f and L_recon of one policy."""
-        if not self._known:
-            self._known.update(assess_all(self.elevation, self.zoo))
+        if name not in self._known:
+            # Specialists are asked for together, and share their patches; often nobody asks for the
+            # generalist, or for nobody else.
+            team = [name] if name == GENERAL else self.specialists
+            asked = {member: self.zoo[member] for member in team}
+            self._known.update(assess_all(self.elevation, asked))
         return self._known[name]
 
     def f(self, name: str) -> Float[Tensor, "nx ny 8"]:

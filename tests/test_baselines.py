@@ -23,7 +23,7 @@ from fgtutor.baselines import (
 )
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, PlanningError
-from fgtutor.tensorization import Assessment, tensorize
+from fgtutor.tensorization import Assessment, assess_all, tensorize
 
 RADIUS = 0.1
 
@@ -122,6 +122,20 @@ def view(make_specialist):
     zoo = {name: make_specialist(name, seed=i) for i, name in enumerate(("gaps", "steps"))}
     zoo["general"] = make_specialist("general", seed=7)
     return View(ground(heights), zoo, "calibrated")
+
+
+def test_a_view_asks_the_generalist_only_where_its_answer_is_wanted(view, monkeypatch):
+    asked = []
+
+    def noted(elevation, zoo):
+        asked.append(sorted(zoo))
+        return assess_all(elevation, zoo)
+
+    monkeypatch.setattr("fgtutor.baselines.assess_all", noted)
+    view.tensor("steps"), view.tensor("gaps")
+    assert asked == [["gaps", "steps"]]
+    view.tensor("general")
+    assert asked == [["gaps", "steps"], ["general"]]
 
 
 def test_a_view_gives_what_tensorize_gives_and_computes_it_once(view, monkeypatch):
