@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fgtutor.errors import ReportError
-from fgtutor.evaluation.report import ROWS, RUN, TABLE
+from fgtutor.evaluation.report import ROWS, RUN, TABLE, markdown
 from fgtutor.storage import atomic_write
 
 README = Path("README.md")
@@ -45,23 +45,23 @@ def block_of(folders: Sequence[Path]) -> str:
                 f"{folder} holds no finished report ({error}): run the command with --out to its "
                 "end"
             ) from error
-        tables.append([line.strip("| ").split(" | ") for line in table.splitlines()])
+        head, _, *lines = (line.strip("| ").split(" | ") for line in table.splitlines())
+        tables.append([head, *lines])
         captions.append(re.sub(r" [\d,]+ trials in all\.$", "", caption))
     if len(set(captions)) > 1:  # which say how many trials a cell has, and how they were driven
         raise ReportError("the folders are not of one table: " + " / ".join(captions))
     settings = [run["settings"] for run in runs]
     _check(settings)
-    lines = ["| " + " | ".join(line) + " |" for line in reduce(join, tables)]
+    head, *lines = reduce(join, tables)
     date, command = max(run["finished"] for run in runs)[:10], settings[0]["command"]
-    return "\n".join(
-        [*lines, "", captions[0], "", f"*{trials:,} trials of `fgtutor {command}`, {date}.*"]
-    )
+    count = f"*{trials:,} trials of `fgtutor {command}`, {date}.*"
+    return "\n\n".join([markdown(head, lines), captions[0], count])
 
 
 def join(one: list[list[str]], other: list[list[str]]) -> list[list[str]]:
     """Return two tables as one: below each other if their heads are the same, else side by side."""
     if one[0] == other[0]:
-        return one + other[2:]
+        return one + other[1:]
     if [line[0] for line in one] == [line[0] for line in other]:
         return [mine + theirs[1:] for mine, theirs in zip(one, other, strict=True)]
     raise ReportError("the folders' tables share neither their lines nor their columns")

@@ -175,8 +175,8 @@ class View:
     def assessment(self, name: str) -> Assessment:
         """Return f and L_recon of one policy."""
         if name not in self._known:
-            # Specialists are asked for together, and share their patches; often nobody asks for the
-            # generalist, or for nobody else.
+            # The specialists share their patches. The generalist is assessed apart: who plans for
+            # the ones seldom asks for the other.
             team = [name] if name == GENERAL else self.specialists
             asked = {member: self.zoo[member] for member in team}
             self._known.update(assess_all(self.elevation, asked))
