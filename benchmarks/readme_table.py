@@ -1,8 +1,9 @@
-"""Write a table into the README from report folders, with the number of trials it stands on.
+"""Write a table into the README or docs/results.md, with the number of trials it stands on.
 
 Reads folders that a `fgtutor evaluate` command has finished; replaces what stands between
-`<!-- table NAME -->` and `<!-- end NAME -->`. Folders of other policies or planners, all else being
-equal, join the first one's table: a specialist that has changed need not wait for the others again.
+`<!-- table NAME -->` and `<!-- end NAME -->` in the page that has these lines. Folders of other
+policies or planners, all else being equal, join the first one's table: a specialist that has
+changed need not wait for the others again.
 Use: python benchmarks/readme_table.py NAME FOLDER [FOLDER ...]
 """
 
@@ -18,18 +19,24 @@ from fgtutor.errors import ReportError
 from fgtutor.evaluation.report import ROWS, RUN, TABLE, markdown
 from fgtutor.storage import atomic_write
 
-README = Path("README.md")
+PAGES = (Path("README.md"), Path("docs/results.md"))
 FREE = {"policies", "planners", "zoo"}
 """Settings in which folders of one table may differ."""
 
 
-def fill(text: str, name: str, block: str) -> str:
-    """Return the text with the block between the markers of `name`, of which there is one pair."""
+def fill(pages: Sequence[Path], name: str, block: str) -> None:
+    """Write the block between the markers of `name`, of which there is one pair in all pages."""
     begin, end = f"<!-- table {name} -->", f"<!-- end {name} -->"
     pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
-    if len(pattern.findall(text)) != 1:
-        raise ReportError(f"expected one pair of lines {begin} and {end}: add them to the file")
-    return pattern.sub(lambda _: f"{begin}\n{block}\n{end}", text)
+    texts = {page: page.read_text() for page in pages}
+    found = [page for page, text in texts.items() for _ in pattern.finditer(text)]
+    if len(found) != 1:
+        raise ReportError(
+            f"expected one pair of lines {begin} and {end}, found {len(found)}: have them once in "
+            + " or ".join(map(str, pages))
+        )
+    with atomic_write(found[0]) as path:
+        path.write_text(pattern.sub(lambda _: f"{begin}\n{block}\n{end}", texts[found[0]]))
 
 
 def block_of(folders: Sequence[Path]) -> str:
@@ -82,9 +89,7 @@ def _check(settings: Sequence[dict[str, Any]]) -> None:
 
 def main(arguments: Sequence[str]) -> None:
     name, *folders = arguments
-    text = fill(README.read_text(), name, block_of([Path(folder) for folder in folders]))
-    with atomic_write(README) as path:
-        path.write_text(text)
+    fill(PAGES, name, block_of([Path(folder) for folder in folders]))
 
 
 if __name__ == "__main__":

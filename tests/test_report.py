@@ -99,11 +99,18 @@ def readme(tmp_path):
 
 
 @pytest.fixture
-def fill(readme, monkeypatch):
+def other(tmp_path):
+    path = tmp_path / "results.md"
+    path.write_text("<!-- table mixed -->\nold\n<!-- end mixed -->\n")
+    return path
+
+
+@pytest.fixture
+def fill(readme, other, monkeypatch):
     spec = importlib.util.spec_from_file_location("readme_table", SCRIPT)
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
-    monkeypatch.setattr(script, "README", readme)
+    monkeypatch.setattr(script, "PAGES", (readme, other))
     return lambda *arguments: script.main([str(argument) for argument in arguments])
 
 
@@ -127,6 +134,15 @@ def test_the_script_writes_the_table_between_its_markers(fill, folder, readme):
             "before\n<!-- table matrix -->\n| a |\n| --- |\n| 100 |\n\nThree trials a cell.\n\n"
             f"*3 trials of `fgtutor evaluate matrix`, {date}.*\n<!-- end matrix -->\nafter\n"
         )
+
+
+def test_the_table_goes_to_the_page_that_has_its_markers(fill, folder, readme, other):
+    before = readme.read_text()
+    fill("mixed", folder)
+    assert "| 100 |" in other.read_text() and readme.read_text() == before
+    readme.write_text(other.read_text())
+    with pytest.raises(ReportError, match=r"table mixed.*found 2"):
+        fill("mixed", folder)
 
 
 def test_folders_of_other_policies_join_the_table(fill, folder, readme):
