@@ -6,7 +6,7 @@
 #   make test-wheel build the wheel and run notebooks 01 and 06 against it in a fresh environment
 #   make check      lint, types, imports
 #   make clean      remove what the targets made (.venv too)
-# PYTHON=/path/to/python chooses the interpreter for .venv (3.11 or newer).
+# PYTHON=/path/to/python chooses the interpreter for .venv (3.11 to 3.14).
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -68,13 +68,13 @@ clean:
 # A version manager may put a python3.13 on the path that does not start: each candidate is tried.
 $(VENV)/bin/python:
 	@set -e; found=; \
-	for candidate in $(or $(PYTHON),python3.13 python3.12 python3.11 python3 python); do \
-	  if $$candidate -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then \
+	for candidate in $(or $(PYTHON),python3.13 python3.12 python3.11 python3.14 python3 python); do \
+	  if $$candidate -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' >/dev/null 2>&1; then \
 	    found=$$candidate; break; fi; \
 	done; \
 	if [ -z "$$found" ]; then \
-	  echo "fgtutor needs Python 3.11 or newer, and none was found on the PATH." >&2; \
-	  echo "Install one, or name it: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)" >&2; exit 1; fi; \
+	  echo "fgtutor needs Python 3.11, 3.12, 3.13 or 3.14, and none was found on the PATH." >&2; \
+	  echo "Install one, or name it: make PYTHON=/path/to/python3.13 $(MAKECMDGOALS)" >&2; exit 1; fi; \
 	if ! $$found -c 'import ensurepip, venv' >/dev/null 2>&1; then \
 	  echo "$$found has no venv module, which fgtutor needs to install beside your system." >&2; \
 	  echo "On Debian or Ubuntu: apt install python3-venv. Or: make PYTHON=/path/to/another" >&2; \
