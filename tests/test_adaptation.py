@@ -182,6 +182,7 @@ def config(make_climber, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_the_command_drives_reports_and_resumes(config, capsys, monkeypatch):
     assert list(config.load_checkpoints()) == ["novice", "able"]  # by samples, not by name
     assert run(config) == 0

@@ -48,6 +48,7 @@ def test_the_package_and_its_help_load_nothing_heavy(module):
     assert fresh(code).endswith("False")
 
 
+@pytest.mark.slow
 def test_the_spine_loads_no_simulator_and_no_notebook():
     code = (
         "import sys, fgtutor\n"

@@ -41,6 +41,7 @@ def test_commands_are_understood(page, monkeypatch):
         assert cli.main(shlex.split(line, comments=True)[1:]) == 0 and len(asked) == 1, line
 
 
+@pytest.mark.slow
 def test_the_example_in_the_readme_drives_to_its_goal(capsys):
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     exec(example, {})

@@ -101,6 +101,7 @@ def test_a_gl_backend_that_does_not_exist_is_named_with_a_reason(monkeypatch):
     assert finding.state == "note" and "crayons" in finding.value and "MUJOCO_GL" in finding.fix
 
 
+@pytest.mark.slow
 def test_the_gl_probe_agrees_with_drawing_here(monkeypatch):
     # Whatever this machine can do, the probe says of each backend what a drawing process says.
     for backend in GL_BACKENDS.get(sys.platform, ()):

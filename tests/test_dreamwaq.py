@@ -324,6 +324,7 @@ def tiny(folder, robot="toy", **changes):
     return make(out=Path(folder), terrain="steps", **TINY | changes)
 
 
+@pytest.mark.slow
 def test_training_gives_a_blind_specialist_with_a_critic_that_sees(tmp_path):
     rows = []
     specialist = train(tiny(tmp_path), on_iteration=rows.append)

@@ -91,6 +91,7 @@ def test_who_comes_no_further_runs_out_of_time_early(make_rolling):
     assert 2 + 1.4 / 0.85 < episode.seconds < 7, "its time limit would be 17 s"
 
 
+@pytest.mark.slow
 def test_a_batch_gives_what_single_trials_give(make_rolling):
     terrains = [make_terrain("rubble", difficulty=0.3, seed=seed) for seed in (1, 3, 5)]
     routes = [straight(t.elevation, t.start, (6.0, t.start[1])) for t in terrains]

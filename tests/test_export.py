@@ -51,6 +51,7 @@ def seeing(make_specialist) -> Specialist:
     return make_specialist(robot="a1", policy=policy, grid=A1_GRID, feasibility=net)
 
 
+@pytest.mark.slow
 def test_the_exported_policy_answers_as_the_specialist_does(seeing, tmp_path):
     path = tmp_path / "policy.onnx"
     assert export.export_policy(seeing, path) < 1e-5

@@ -84,6 +84,7 @@ def pixels(figure) -> np.ndarray:
 # Figures ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_picture_shows_itself_without_pyplot():
     code = (
         "import sys, numpy as np\n"

@@ -325,6 +325,7 @@ def test_the_kernel_itself_refuses(tmp_path, action):
 # Whatever comes, the batch goes on ----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [

@@ -176,6 +176,7 @@ def test_the_robot_shades_the_ground_but_is_not_in_the_cloud() -> None:
 # -- maps ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "name"),
     [

@@ -30,6 +30,7 @@ def config(zoo):
     )
 
 
+@pytest.mark.slow
 def test_rows_name_every_outcome(config):
     rows = {(row["terrain"], row["policy"]): row for row in evaluate(config)}
     assert list(rows) == [
@@ -103,6 +104,7 @@ def test_more_trials_in_the_same_folder_drive_only_the_new_ones(config, monkeypa
         evaluate(replace(more, protocol="paper", out=config.zoo.parent / "paper"))
 
 
+@pytest.mark.slow
 def test_the_command_writes_rows_and_a_report_and_prints_a_table(config, capsys):
     folder = config.zoo.parent / "report"
     config = replace(config, terrains=("flat",), out=folder)

@@ -39,6 +39,7 @@ def test_the_folder_is_missing_and_then_there(config):
     assert (config.zoo / "steps" / "specialist.json").exists()
 
 
+@pytest.mark.slow
 def test_a_newcomer_may_lie_outside_the_zoo(config, make_rolling, tmp_path):
     folder = save_specialist(make_rolling("rubble", f=0.8), tmp_path / "run" / "specialist")
     outside = replace(config, newcomer=str(folder))

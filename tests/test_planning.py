@@ -80,6 +80,7 @@ def check_route(route: Route, fused, policy_map, grid: ElevationMap, start, goal
     assert route.length == pytest.approx(np.linalg.norm(np.diff(route.xy, axis=0), axis=1).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", ["inverse", "length"])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_two_hundred_random_maps_cost_what_networkx_says(backend, cost):

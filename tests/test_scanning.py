@@ -99,6 +99,7 @@ def test_every_format_gives_the_points_back(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(points, cloud(), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COUNTED)
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
 def test_a_file_cut_off_is_refused(tmp_path: Path, name: str, share: float) -> None:
@@ -109,6 +110,7 @@ def test_a_file_cut_off_is_refused(tmp_path: Path, name: str, share: float) -> N
         read_points(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_damaged_file_is_read_or_refused(tmp_path: Path, name: str) -> None:
     path = written(tmp_path, name, cloud(20))

@@ -132,6 +132,7 @@ def test_a_scan_is_close_to_the_truth_and_not_the_truth():
     assert not np.array_equal(seen.heights, other.heights, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_the_command_drives_reports_and_resumes(config, capsys, monkeypatch):
     config = replace(config, out=config.zoo.parent / "report")
     assert run(config) == 0

@@ -94,6 +94,7 @@ def _is_thin(box: Box, x: float, y: float) -> bool:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("name", TERRAINS)
 def test_terrain_maps_against_the_search(name: str, robot: str) -> None:

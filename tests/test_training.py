@@ -234,6 +234,7 @@ def test_from_a_run_its_critic_and_net_come_along_and_nothing_warms_up(trained, 
     assert any(not torch.equal(v, policy.state_dict()[k]) for k, v in first.items())
 
 
+@pytest.mark.slow
 def test_a_resumed_run_knows_what_it_started_from_and_goes_on_beyond_its_end(trained, tmp_path):
     start = shutil.copytree(trained[0].folder / "specialist", tmp_path / "start")
     settings = TINY | {"iterations": 1, "critic_warmup": 2, "warm_std": 0.125}
@@ -339,6 +340,7 @@ def test_a_run_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
         train(TrainConfig(out=tmp_path / "file" / "run", **TINY))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows delivers Ctrl-C to the whole console")
 def test_ctrl_c_saves_and_returns_what_was_learned(tmp_path):
     def interrupt(row):
@@ -385,6 +387,7 @@ def test_rows_rise_from_the_easiest_difficulty_to_the_whole():
 RISING = TINY | {"rows": 5, "easiest": 0.2, "easiest_at_last": 0.8, "std_at_last": 0.1}
 
 
+@pytest.mark.slow
 def test_the_first_row_rises_where_robots_have_outgrown_it_and_they_keep_their_difficulty(tmp_path):
     config = TrainConfig(out=tmp_path, **RISING)
     trainer = Trainer(config)

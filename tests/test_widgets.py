@@ -121,6 +121,7 @@ def test_a_drive_plays_pauses_and_resets(widgets, make_rolling):
     assert len(board.drive.episode.poses) == 1 and not board.play.playing
 
 
+@pytest.mark.slow
 def test_without_anywidget_there_is_a_png(widgets):
     code = (
         "import sys; sys.modules['anywidget'] = None\n"
