@@ -14,6 +14,11 @@ from fgtutor.errors import FgtutorError
 COMMANDS = {
     "demo": ("demo", "DemoConfig", "plan over a mixed terrain and drive it"),
     "train": ("training", "config_of", "train a specialist with its Feasibility-Net"),
+    "sweep": (
+        "evaluation.sweep",
+        "config_of",
+        "train many specialists side by side, and compare them",
+    ),
     "plan": ("pipeline", "PlanConfig", "plan a route over a map file"),
     "evaluate matrix": (
         "evaluation.matrix",

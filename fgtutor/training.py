@@ -288,6 +288,7 @@ class Trainer:
             },
             provenance={
                 "terrain": config.terrain,
+                "iteration": self.iteration,
                 "samples": self.samples,
                 "seed": config.seed,
                 "processes": distributed.processes(),
@@ -321,19 +322,22 @@ def _read(checkpoint: Path) -> dict[str, Any]:
 
 
 def train(
-    config: TrainConfig, *, on_iteration: Callable[[dict[str, float]], None] | None = None
+    config: TrainConfig,
+    *,
+    on_iteration: Callable[[dict[str, float]], None] | None = None,
+    progress: bool = True,
 ) -> Specialist:
     """Train one specialist; write its folder to `<run>/specialist` and return it.
 
-    Shows a progress bar with the time left. Ctrl-C saves a checkpoint and returns what has been
-    learned; `config.resume` continues. `on_iteration` gets each iteration's numbers (the notebooks
-    draw them).
+    Shows a progress bar with the time left, unless `progress` is off. Ctrl-C saves a checkpoint and
+    returns what has been learned; `config.resume` continues. `on_iteration` gets each iteration's
+    numbers (the notebooks draw them).
     """
     with distributed.leave_at_end():
         trainer = Trainer(config)
         if config.resume:
             trainer.resume()
-        _iterate(trainer, on_iteration)
+        _iterate(trainer, on_iteration, progress)
         specialist = trainer.specialist()
         if leads():
             save_specialist(specialist, config.folder / "specialist")
@@ -341,7 +345,7 @@ def train(
 
 
 def _iterate(
-    trainer: Trainer, on_iteration: Callable[[dict[str, float]], None] | None = None
+    trainer: Trainer, on_iteration: Callable[[dict[str, float]], None] | None, progress: bool
 ) -> None:
     """Train to the end, to the time limit or to a Ctrl-C, and leave a checkpoint."""
     from torch.utils.tensorboard import SummaryWriter
@@ -354,7 +358,10 @@ def _iterate(
         if leads()
         else contextlib.nullcontext() as writer,
         tqdm(
-            total=config.iterations, initial=trainer.iteration, unit="it", disable=not leads()
+            total=config.iterations,
+            initial=trainer.iteration,
+            unit="it",
+            disable=not (progress and leads()),
         ) as bar,
         stop_on_interrupt() as stopped,
     ):

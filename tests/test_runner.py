@@ -1,5 +1,7 @@
 import os
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ from fgtutor.evaluation.runner import ATTEMPTS, Task, run_tasks
 
 # Workers import the tasks' functions, so they live in a module of their own, on the path.
 WORK = """
-import os, signal, sys
+import os, signal, sys, time
 from pathlib import Path
 
 from fgtutor.errors import TerrainError
@@ -33,6 +35,15 @@ def killed(folder):
     with open(Path(folder) / "deaths", "a") as file:
         file.write("x")
     os.kill(os.getpid(), signal.SIGKILL)
+
+def left_alone(folder):
+    # Whoever asked for this is killed; nobody waits for it any more.
+    Path(folder, "worker").write_text(str(os.getpid()))
+    time.sleep(600)
+
+def resources():
+    import ray
+    return [ray.get_runtime_context().get_assigned_resources()]
 
 def wrong():
     return [1 / 0]
@@ -99,6 +110,46 @@ def test_a_task_that_always_kills_its_worker_is_named(work, tmp_path):
     assert Path(tmp_path, "deaths").read_text() == "x" * ATTEMPTS
 
 
+@pytest.mark.slow
+def test_workers_end_with_whoever_is_killed(work, tmp_path):
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import fgtutor_work as work\n"
+        "from fgtutor.evaluation.runner import Task, run_tasks\n"
+        "tasks = [Task(name='a', function=work.left_alone, arguments=(sys.argv[1],)),\n"
+        "         Task(name='b', function=work.square, arguments=(2,))]\n"
+        "if __name__ == '__main__': list(run_tasks(tasks, workers=2))"
+    )
+    script = tmp_path / "asks.py"
+    script.write_text(code)
+    asks = subprocess.Popen([sys.executable, str(script), str(tmp_path)])
+    started = tmp_path / "worker"
+    assert eventually(lambda: started.exists() and started.read_text())
+    worker = int(started.read_text())
+    asks.kill()
+    asks.wait()
+    assert eventually(lambda: not alive(worker))
+
+
+def eventually(condition, seconds=60):
+    """Tell whether a condition comes true in time."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def alive(process):
+    """Tell whether a process is there, and not only waiting to be buried."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    state = Path(f"/proc/{process}/stat")  # on Linux
+    return not (state.exists() and state.read_text().rpartition(")")[2].split()[0] == "Z")
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_what_a_task_raises_reaches_the_caller(work, workers):
     refused = [Task(name="a", function=work.refused), Task(name="b", function=work.refused)]
@@ -139,5 +190,9 @@ def test_ray_gives_the_same_and_survives_a_killed_worker(work, tmp_path, monkeyp
     }
     with pytest.raises(TerrainError, match="moon"):
         results([Task(name="a", function=work.refused)], ray="local")
+    two = Task(name="two", function=work.resources, cores=2)
+    assert results([two], ray="local")["two"].rows == [{"CPU": 2.0}]
+    with pytest.raises(ConfigError, match=r"task a takes 1 cores and 1000 GPUs, more than any"):
+        results([Task(name="a", function=work.resources, gpus=1000)], ray="local")
     with pytest.raises(ConfigError, match="no Ray cluster answers"):
         results(squares(work), ray="auto")  # the local one has ended

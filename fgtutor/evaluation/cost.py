@@ -1,11 +1,13 @@
 """What an evaluation will take, before it starts: a small sample, measured here and now.
 
-Reads a zoo and one terrain of each kind; gives numbers of maps and episodes, and hours.
+Reads a zoo and one terrain of each kind; gives numbers of maps and episodes, and hours. What
+another kind of run takes, such as trainings (`sweep`), is an `Estimate` too.
 """
 
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -16,6 +18,21 @@ from fgtutor.planning import plan
 from fgtutor.specialist import Specialist
 from fgtutor.tensorization import assess_all
 from fgtutor.terrain import Terrain
+
+
+class Estimate(Protocol):
+    """What a run will take."""
+
+    def on(self, cores: int) -> str:
+        """Say it, for a number of cores."""
+        ...
+
+
+def on_cores(seconds: float, cores: int) -> str:
+    """Say what `seconds` of one core come to on a number of them."""
+    hours = seconds / cores / 3600
+    time = f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min"
+    return f"about {time} on {cores} core{'s' * (cores > 1)} like this one"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,11 +48,9 @@ class Cost:
 
     def on(self, cores: int) -> str:
         """Say it, for a number of cores."""
-        hours = self.seconds / cores / 3600
-        time = f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min"
         return (
-            f"{self.maps:,} maps to assess and up to {self.episodes:,} episodes, at most about "
-            f"{time} on {cores} core{'s' * (cores > 1)} like this one"
+            f"{self.maps:,} maps to assess and up to {self.episodes:,} episodes, at most "
+            f"{on_cores(self.seconds, cores)}"
         )
 
 

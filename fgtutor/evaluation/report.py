@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-from fgtutor.evaluation.cost import Cost
+from fgtutor.evaluation.cost import Estimate
 from fgtutor.evaluation.metrics import wilson_interval
 from fgtutor.evaluation.runner import Row, Task
 from fgtutor.evaluation.shards import Run, RunConfig, collect, finished
@@ -84,7 +84,7 @@ def run_and_report(
     title: str,
     tasks: Sequence[Task],
     settings: dict[str, Any],
-    cost: Callable[[], Cost],
+    cost: Callable[[], Estimate],
     find: Callable[[list[Row]], Findings],
 ) -> int:
     """Say what an evaluation will cost, do what is left of it, print and keep what it found.

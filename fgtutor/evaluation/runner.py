@@ -9,6 +9,7 @@ import os
 import pickle
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections import Counter, deque
@@ -16,8 +17,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import import_module
-from multiprocessing import connection, get_context
+from multiprocessing import connection, get_context, parent_process
 from typing import Any
+
+from tqdm import tqdm
 
 from fgtutor.errors import ConfigError, EvaluationError, FgtutorError, MissingExtraError
 from fgtutor.evaluation.provenance import machine
@@ -38,6 +41,10 @@ class Task:
     """Computes the rows from the arguments alone; workers import it from its module."""
     arguments: tuple[Any, ...] = ()
     """What it is called with; they are pickled."""
+    cores: int = 1
+    """Cores that it takes of a Ray cluster; on this machine, `workers` says how many share it."""
+    gpus: int = 0
+    """GPUs that it takes of a Ray cluster."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +81,8 @@ def run_tasks(
         EvaluationError: A task raised something unexpected, or its worker died `ATTEMPTS` times.
         FgtutorError: What a task raised on purpose, as it is.
         MissingExtraError: `ray` is given, but Ray is not installed.
-        ConfigError: No Ray cluster answers at that address.
+        ConfigError: No Ray cluster answers at that address, or none of its machines has the cores
+            or GPUs that a task takes.
     """
     if ray is not None:
         yield from _on_ray(tasks, ray)
@@ -141,7 +149,7 @@ class _Worker:
         # Spawned, not forked: torch's threads do not survive a fork.
         context = get_context("spawn")
         self.line, theirs = context.Pipe()
-        # A daemon: should this process end without a word, the worker ends too.
+        # A daemon is stopped when this process ends; if it is killed, the worker sees to that.
         self.process = context.Process(target=_serve, args=(theirs,), daemon=True)
         self.process.start()
         theirs.close()  # or the end of the worker would not be the end of the line
@@ -165,9 +173,19 @@ class _Worker:
 def _serve(line: connection.Connection) -> None:
     """Do the tasks that come down the line, until it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asked
+    # Its default is one between processes, which a process that is stopped leaves behind.
+    tqdm.set_lock(threading.RLock())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):
         while True:
             line.send(_work(line.recv_bytes()))
+
+
+def _end_with_parent() -> None:
+    """End this process as soon as the one that asked has, even in the middle of a task."""
+    if parent := parent_process():
+        parent.join()
+        os._exit(1)
 
 
 def _on_processes(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, Result]]:
@@ -217,9 +235,13 @@ def _on_ray(tasks: Sequence[Task], address: str) -> Iterator[tuple[Task, Result]
             "or say --ray local for one on this machine only"
         ) from error
     try:
+        _check_cluster([node["Resources"] for node in ray.nodes() if node["Alive"]], tasks)
         # Ray itself does a task again whose worker vanished.
-        remote = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_work)
-        running = {remote.remote(pickle.dumps(task)): task for task in tasks}
+        remote = ray.remote(max_retries=ATTEMPTS - 1)(_work)
+        running = {
+            remote.options(num_cpus=task.cores, num_gpus=task.gpus).remote(pickle.dumps(task)): task
+            for task in tasks
+        }
         while running:
             (done,), _ = ray.wait(list(running), num_returns=1)
             task = running.pop(done)
@@ -230,3 +252,19 @@ def _on_ray(tasks: Sequence[Task], address: str) -> Iterator[tuple[Task, Result]
             yield task, _unwrap(task, outcome)
     finally:
         ray.shutdown()
+
+
+def _check_cluster(machines: Sequence[dict[str, float]], tasks: Sequence[Task]) -> None:
+    """Raise `ConfigError` if a task takes more than any machine has: Ray would wait for ever."""
+    for task in tasks:
+        if task.cores == 1 and not task.gpus:  # any machine will do, also one that is yet to join
+            continue
+        if not any(
+            machine.get("CPU", 0) >= task.cores and machine.get("GPU", 0) >= task.gpus
+            for machine in machines
+        ):
+            raise ConfigError(
+                f"task {task.name} takes {task.cores} cores and {task.gpus} GPUs, more than any "
+                f"of the cluster's {len(machines)} machines has: ask for fewer, or let a larger "
+                "machine join"
+            )

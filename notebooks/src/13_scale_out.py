@@ -214,7 +214,11 @@ draw_rates({name: (s.successes, s.trials) for name, s in by_policy.items()},
 #
 #     fgtutor evaluate matrix --robot a1 --protocol paper --ray HOST:PORT --out report
 #
-# A worker that vanishes costs its task one more try, and nothing else.
+# A worker that vanishes costs its task one more try, and nothing else. *Training* spreads in the
+# same way: a sweep trains a specialist for every terrain and seed, each of them a task that goes on
+# from its checkpoint if its worker is lost, and compares what came out:
+#
+#     fgtutor sweep --robot a1 --terrains steps valley --seeds 1 2 3 --ray HOST:PORT --out sweep
 
 # %% [markdown]
 # ## More robots at once

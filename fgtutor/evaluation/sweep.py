@@ -1,0 +1,349 @@
+"""Many trainings side by side: terrains, seeds and the values of one setting, compared.
+
+Reads a training's settings and what to vary; trains a specialist each, drives it over held-out
+terrain with its own plan, and gives a row a crossing. A training is a task of the runner, so cores,
+a Ray cluster or machines with a part each share them. Its run folder lies in the report folder;
+a worker that is killed in it costs the time since the last checkpoint, and not a bit of the result.
+"""
+
+import contextlib
+import hashlib
+import io
+import math
+import os
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import tyro
+
+from fgtutor import training
+from fgtutor.baselines import single
+from fgtutor.errors import ConfigError, EvaluationError, FgtutorError, SpecialistError
+from fgtutor.evaluation import calibration, report
+from fgtutor.evaluation.calibration import CalibrationConfig
+from fgtutor.evaluation.chart import share_chart
+from fgtutor.evaluation.cost import on_cores
+from fgtutor.evaluation.metrics import calibration as compare
+from fgtutor.evaluation.report import Findings, Share, markdown
+from fgtutor.evaluation.runner import Row, Task
+from fgtutor.evaluation.shards import RunConfig, settings_of
+from fgtutor.evaluation.success import TrialsConfig, cut, make_ground
+from fgtutor.evaluation.trials import drive
+from fgtutor.recipe import A1TrainConfig, TrainConfig, comparable
+from fgtutor.recipe import config_of as recipe_of
+from fgtutor.robots import env_class
+from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist
+from fgtutor.terrain import SCALES
+from fgtutor.training import CHECKPOINT, Trainer
+
+COMMAND = "sweep"
+RUNS = "runs"
+"""Where in the report folder the run folders lie."""
+OURS_TO_SET = {
+    "robot": "--robot",
+    "terrain": "--terrains",
+    "seed": "--seeds",
+    "out": "--out",
+    "resume": "the same command, which goes on by itself",
+    "hours": "--train.iterations, since a table may not depend on a machine's speed",
+}
+"""Settings of a training that a sweep sets, and what to say instead."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepConfig(RunConfig):
+    """Train a specialist for every terrain, seed and value of a setting, and compare them."""
+
+    out: Path | None = Path("runs/sweep")
+    """Report folder, with a run folder a training in `runs`. The same command goes on from there;
+    with more terrains, seeds or values only the new ones are trained."""
+    robot: str = "toy"
+    """Which robot."""
+    terrains: tuple[str, ...] = ()
+    """Terrains to specialise in; default: the robot's own."""
+    seeds: tuple[int, ...] = (1, 2, 3)
+    """Seeds of the trainings."""
+    vary: tuple[str, ...] = ()
+    """One more thing to vary: an option of `fgtutor train` and its values, as in `learning-rate
+    1e-3 3e-4`."""
+    trials: int = 50
+    """Held-out terrains of full difficulty that each specialist then crosses."""
+    train: TrainConfig = field(default_factory=TrainConfig)
+    """What all trainings share, as for `fgtutor train`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.out is None:
+            raise ConfigError("trainings keep their checkpoints in a folder: give --out FOLDER")
+        if self.trials < 1 or not self.seeds:
+            raise ConfigError(f"need trials >= 1 and a seed, got {self.trials} and {self.seeds}")
+        shared, default = asdict(self.train), asdict(type(self.train)(robot=self.robot))
+        for name, instead in OURS_TO_SET.items():
+            if shared[name] != default[name]:
+                raise ConfigError(f"a sweep sets {name} of its trainings: use {instead}")
+        if len(self.vary) == 1:
+            raise ConfigError(f"nothing to vary {self.vary[0]} by: give its values too")
+        if self.vary and self.vary[0].replace("-", "_") in OURS_TO_SET:
+            raise ConfigError(f"a sweep varies {self.vary[0]} in its own way: see --help")
+
+    @property
+    def folder(self) -> Path:
+        """The report folder, from wherever a worker looks at it."""
+        return Path(self.out or "").resolve()
+
+
+@dataclass(frozen=True, kw_only=True)
+class A1SweepConfig(SweepConfig):
+    """The same with the A1's sizes: about an hour of one core a training."""
+
+    robot: str = "a1"
+    train: TrainConfig = field(default_factory=A1TrainConfig)
+
+
+def config_of(words: Sequence[str]) -> type[SweepConfig]:
+    """Return the config class for command line `words`, which may hold `--robot NAME`."""
+    return A1SweepConfig if recipe_of(words) is A1TrainConfig else SweepConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """One training of a sweep."""
+
+    name: str
+    """Unlike any other's; it names the run folder."""
+    setting: str
+    """The value of what is varied, or nothing."""
+    config: TrainConfig
+    """All its settings."""
+
+
+def trainings(config: SweepConfig) -> list[Training]:
+    """Return the trainings of a sweep, in the table's order.
+
+    Raises `ConfigError` if a value does not fit, or two trainings would be the same.
+    """
+    env_class(config.robot)  # an unknown robot fails here
+    option, *values = config.vary or ("", "")
+    everyone = [
+        _training(config, terrain, option, value, seed)
+        for terrain in config.terrains or SCALES[config.robot].mixed
+        for value in values
+        for seed in config.seeds
+    ]
+    names = [training.name for training in everyone]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise ConfigError(f"asked twice for {', '.join(sorted(twice))}: give each value once")
+    for each in everyone:  # as does an unknown terrain
+        training.training_world(replace(each.config, rows=1, columns=1))
+    return everyone
+
+
+def _training(config: SweepConfig, terrain: str, option: str, value: str, seed: int) -> Training:
+    setting = f"{option}-{re.sub(r'[^A-Za-z0-9.+-]', '_', value)}" if option else ""
+    name = "-".join(filter(None, (terrain, setting, str(seed))))
+    start = config.train.start_from
+    own = replace(
+        config.train,
+        terrain=terrain,
+        seed=seed,
+        out=config.folder / RUNS / name,
+        start_from=start and start.resolve(),
+    )
+    return Training(name=name, setting=value, config=_with(own, option, value) if option else own)
+
+
+def _with(config: TrainConfig, option: str, value: str) -> TrainConfig:
+    """Return the settings with one of them read from the command line's words for it."""
+    words, said = [f"--{option}", *value.split()], io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(type(config), args=words, default=config, console_outputs=False)
+    except SystemExit as error:
+        raise ConfigError(
+            f"a training has no {' '.join(words)}: `fgtutor train --help` lists what it takes"
+        ) from error
+
+
+def run_task(work: Training, trials: int) -> list[Row]:
+    """Do one task: train, or go on where a worker was lost, then cross held-out terrain."""
+    resume = (work.config.folder / CHECKPOINT).exists()
+    try:
+        specialist = training.train(replace(work.config, resume=resume), progress=False)
+        if specialist.provenance["iteration"] < work.config.iterations:
+            raise KeyboardInterrupt  # which training took as a wish to stop, and saved
+        return _crossings(work, specialist, trials)
+    except FgtutorError as error:
+        raise EvaluationError(f"training {work.name}: {error}") from error
+
+
+def _crossings(work: Training, specialist: Specialist, trials: int) -> list[Row]:
+    """Return a row a crossing of held-out terrain, as `fgtutor evaluate matrix` would drive it."""
+    config = work.config
+    kinds = SCALES[config.robot].mixed if config.terrain == GENERAL else (config.terrain,)
+    known = {
+        "training": work.name,
+        "trained_on": config.terrain,
+        "setting": work.setting,
+        "training_seed": config.seed,
+        "samples": specialist.provenance["samples"],
+        **_tracking(specialist, kinds, trials),
+    }
+    crossings = TrialsConfig(robot=config.robot, trials=trials)
+    rows = []
+    for indices in cut(trials):
+        grounds = [make_ground(crossings, kinds[i % len(kinds)], i) for i in indices]
+        planned = {specialist.name: partial(single, specialist.name)}
+        driven = drive(grounds, planned, {specialist.name: specialist}, cost=crossings.cost)
+        rows += [known | asdict(trial) for trial in driven]
+    return rows
+
+
+def _tracking(specialist: Specialist, kinds: Sequence[str], envs: int) -> dict[str, float]:
+    """Return the mean r_v on held-out terrain, and how far its prediction is from it."""
+    config = CalibrationConfig(robot=specialist.robot, envs=envs)
+    drives = [calibration.drive(specialist, kind, config) for kind in kinds]
+    measured = np.concatenate([drive.measured for drive in drives])
+    _, error = compare(np.concatenate([drive.predicted for drive in drives]), measured)
+    return {"r_v": round(float(measured.mean()), 4), "calibration_error": round(error, 4)}
+
+
+def make_tasks(config: SweepConfig) -> list[Task]:
+    """Return a task a training, with the cores and the GPU that it takes."""
+    return [
+        Task(
+            name=each.name,
+            function=run_task,
+            arguments=(each, config.trials),
+            cores=each.config.threads,
+            gpus=int(each.config.device.startswith("cuda")),
+        )
+        for each in trainings(config)
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingCost:
+    """What the trainings take, if all stay as fast as the first one begins."""
+
+    trainings: int
+    samples: int
+    """Of all trainings."""
+    seconds: float
+    """Of all trainings one after the other, s."""
+
+    def on(self, cores: int) -> str:
+        """Say it, for a number of trainings at a time."""
+        rounds = math.ceil(self.trainings / cores)
+        return (
+            f"{self.trainings} trainings with {self.samples:,} samples, at least "
+            f"{on_cores(self.seconds / self.trainings * rounds * cores, cores)}"
+        )
+
+
+def estimate(config: SweepConfig) -> TrainingCost:
+    """Measure the second iteration of the first training, and work out what all of them take."""
+    works = [each.config for each in trainings(config)]
+    trainer = Trainer(works[0])
+    first, second = (trainer.iterate()["seconds"] for _ in range(2))
+    samples = sum(work.iterations * work.num_envs * work.steps for work in works)
+    per_sample = (second - first) / (works[0].num_envs * works[0].steps)
+    return TrainingCost(trainings=len(works), samples=samples, seconds=samples * per_sample)
+
+
+def _groups(rows: Sequence[Row]) -> Iterator[tuple[tuple[str, str], dict[int, list[Row]]]]:
+    """Give for every terrain and value the crossings by seed, in the order of the trainings."""
+    groups: dict[tuple[str, str], dict[int, list[Row]]] = {}
+    for row in rows:
+        seeds = groups.setdefault((row["trained_on"], row["setting"]), {})
+        seeds.setdefault(row["training_seed"], []).append(row)
+    yield from groups.items()
+
+
+def _share(rows: Sequence[Row]) -> Share:
+    return Share.of(row["outcome"] == "reached" for row in rows)
+
+
+def table(rows: Sequence[Row], option: str = "") -> str:
+    """Return the crossings as a Markdown table: a line a terrain and value, a column a seed."""
+    lines, seeds = [], list(dict.fromkeys(row["training_seed"] for row in rows))
+    for (terrain, setting), by_seed in _groups(rows):
+        shares = [_share(by_seed[seed]) for seed in seeds]
+        firsts = [by_seed[seed][0] for seed in seeds]
+        lines.append(
+            [
+                terrain,
+                *([setting] if option else []),
+                f"{firsts[0]['samples']:,}",
+                *shares,
+                f"{100 * fmean(share.successes / share.trials for share in shares):.1f}",
+                f"{fmean(first['r_v'] for first in firsts):.3f}",
+                f"{fmean(first['calibration_error'] for first in firsts):.3f}",
+            ]
+        )
+    varied, names = ([option] if option else []), (f"seed {seed}" for seed in seeds)
+    return markdown(
+        ["terrain", *varied, "samples", *names, "mean", "r_v", "calibration error"], lines
+    )
+
+
+def run(config: SweepConfig) -> int:
+    """Train from the command line, print the table and write the report."""
+    option = config.vary[0] if config.vary else ""
+    # A training's own threads are cores that no other one has.
+    workers = config.workers or max(1, (os.cpu_count() or 1) // config.train.threads)
+    title = f"Trainings side by side ({config.robot})"
+
+    def find(rows: list[Row]) -> Findings:
+        groups = {
+            " ".join(filter(None, (terrain, option, setting))): {
+                f"seed {seed}": _share(crossings) for seed, crossings in by_seed.items()
+            }
+            for (terrain, setting), by_seed in _groups(rows)
+        }
+        chart = share_chart(groups, title)
+        return Findings(
+            table=table(rows, option),
+            caption=f"Success in % with 95 % intervals, {config.trials} crossings of held-out "
+            f"terrain a training, each with its own plan; r_v and calibration error there are "
+            f"means over the seeds; robot {config.robot}, {config.train.iterations} iterations.",
+            figures={"success.svg": partial(Path.write_text, data=chart)},
+        )
+
+    tasks = make_tasks(config)
+    print(f"the curves, while they train: tensorboard --logdir {config.folder / RUNS}")
+    return report.run_and_report(
+        replace(config, workers=workers),
+        title=title,
+        tasks=tasks,
+        settings=_settings(config),
+        cost=partial(estimate, config),
+        find=find,
+    )
+
+
+def _settings(config: SweepConfig) -> dict[str, Any]:
+    """Return what a training's crossings depend on, but for what tells the trainings apart."""
+    shared = comparable(config.train)
+    del shared["terrain"], shared["seed"]
+    return settings_of(
+        config,
+        COMMAND,
+        without=("terrains", "seeds", "vary", "train"),
+        vary=config.vary[:1],
+        train=shared,
+        start=_digest(config.train.start_from) if config.train.start_from else None,
+    )
+
+
+def _digest(start: Path) -> str:
+    """Return a digest of the policy to start from; raises `SpecialistError` if there is none."""
+    files = [start / name for name in (CHECKPOINT, DESCRIPTION) if (start / name).is_file()]
+    if not files:
+        raise SpecialistError(f"{start} holds no specialist to start from: give another folder")
+    return hashlib.sha256(files[0].read_bytes()).hexdigest()[:16]

@@ -1,0 +1,328 @@
+"""Trainings as tasks: the same rows however they were run, stopped or killed."""
+
+import json
+import os
+import signal
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+
+from fgtutor import training
+from fgtutor.errors import (
+    CheckpointError,
+    ConfigError,
+    EvaluationError,
+    ReportError,
+    SpecialistError,
+    TerrainError,
+)
+from fgtutor.evaluation import sweep
+from fgtutor.evaluation.runner import run_tasks
+from fgtutor.evaluation.sweep import (
+    A1SweepConfig,
+    SweepConfig,
+    TrainingCost,
+    config_of,
+    estimate,
+    make_tasks,
+    table,
+    trainings,
+)
+from fgtutor.evaluation.trials import Trial
+from fgtutor.recipe import A1TrainConfig, TrainConfig
+from fgtutor.specialist import load_specialist
+
+TINY = TrainConfig(
+    num_envs=4, steps=8, rows=2, columns=2, label_seconds=0.12, save_every=2, iterations=6
+)
+
+
+@pytest.fixture
+def config(tmp_path):
+    return SweepConfig(
+        out=tmp_path / "sweep", terrains=("steps",), seeds=(1, 2), trials=2, train=TINY, workers=1
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder of an unbroken sweep of two seeds."""
+    out = tmp_path_factory.mktemp("whole") / "sweep"
+    config = SweepConfig(
+        out=out, terrains=("steps",), seeds=(1, 2), trials=2, train=TINY, workers=1
+    )
+    assert sweep.run(config) == 0
+    return out
+
+
+def same(one: Path, other: Path) -> bool:
+    """Tell whether two sweeps gave the same rows, table and specialists, to the last byte."""
+    names = ["rows.json", "table.md"]
+    for run in (one / "runs").iterdir():
+        names += [
+            f"runs/{run.name}/specialist/{net}.safetensors" for net in ("policy", "feasibility")
+        ]
+    return all((one / name).read_bytes() == (other / name).read_bytes() for name in names)
+
+
+def test_the_robot_decides_the_sizes():
+    assert config_of(["--robot", "a1"])().train == A1TrainConfig()
+    assert config_of(["--seeds", "1"])().train == TrainConfig()
+    assert A1SweepConfig().robot == "a1"
+
+
+def test_every_terrain_value_and_seed_is_a_training(config, tmp_path):
+    config = replace(
+        config, terrains=("steps", "gaps"), vary=("learning-rate", "1e-3", "5e-4"), seeds=(3, 4)
+    )
+    everyone = trainings(config)
+    assert [each.name for each in everyone] == [
+        f"{terrain}-learning-rate-{value}-{seed}"
+        for terrain in ("steps", "gaps")
+        for value in ("1e-3", "5e-4")
+        for seed in (3, 4)
+    ]
+    last = everyone[-1].config
+    assert (last.terrain, last.learning_rate, last.seed) == ("gaps", 5e-4, 4)
+    assert last.folder == config.folder / "runs" / everyone[-1].name
+    rest = ("terrain", "seed", "out", "learning_rate")
+    theirs, mine = asdict(last), asdict(TINY)
+    assert {k: v for k, v in theirs.items() if k not in rest} == {
+        k: v for k, v in mine.items() if k not in rest
+    }
+
+
+def test_values_of_several_words_and_paths(config):
+    (first, second) = trainings(replace(config, seeds=(1,), vary=("hidden", "8 4", "16")))
+    assert first.config.hidden == (8, 4) and second.config.hidden == (16,)
+    assert first.name == "steps-hidden-8_4-1"
+
+
+def test_by_default_the_robots_own_terrains(config):
+    names = [each.name for each in trainings(replace(config, terrains=(), seeds=(1,)))]
+    assert names == ["steps-1", "gaps-1", "slopes-1", "rubble-1"]
+
+
+def test_a_task_takes_the_cores_and_the_gpu_of_its_training(config):
+    assert [(task.cores, task.gpus) for task in make_tasks(config)] == [(1, 0)] * 2
+    large = replace(config, train=replace(TINY, threads=4, device="cuda:0"))
+    assert [(task.cores, task.gpus) for task in make_tasks(large)] == [(4, 1)] * 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"out": None}, "give --out FOLDER"),
+        ({"trials": 0}, "trials >= 1"),
+        ({"seeds": ()}, "and a seed"),
+        ({"train": TrainConfig(seed=7)}, "sets seed of its trainings: use --seeds"),
+        ({"train": TrainConfig(terrain="gaps")}, "sets terrain .* use --terrains"),
+        ({"train": TrainConfig(resume=True)}, "goes on by itself"),
+        ({"train": TrainConfig(hours=1.0)}, "train.iterations"),
+        ({"train": TrainConfig(out=Path("x"))}, "use --out"),
+        ({"train": TrainConfig(robot="a1")}, "use --robot"),
+        ({"vary": ("gamma",)}, "nothing to vary gamma by"),
+        ({"vary": ("seed", "1", "2")}, "varies seed in its own way"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(config, changes, message):
+    with pytest.raises(ConfigError, match=message):
+        replace(config, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"seeds": (1, 1)}, ConfigError, "asked twice for steps-1"),
+        ({"vary": ("gamma", "0.9", "0.9")}, ConfigError, "asked twice"),
+        ({"vary": ("speed", "1")}, ConfigError, "no --speed 1: .*fgtutor train --help"),
+        ({"vary": ("gamma", "much")}, ConfigError, "no --gamma much"),
+        ({"vary": ("iterations", "0")}, ConfigError, "no --iterations 0"),
+        ({"terrains": ("moon",)}, TerrainError, "moon"),
+        ({"robot": "horse", "train": TrainConfig(robot="horse")}, ConfigError, "horse"),
+        ({"train": replace(TINY, start_from=Path("nobody"))}, SpecialistError, "nobody holds no"),
+    ],
+)
+def test_a_mistake_is_told_before_anything_trains(config, changes, error, message, capfd):
+    with pytest.raises(error, match=message):
+        sweep.run(replace(config, **changes))
+    assert not config.folder.exists()
+    assert not capfd.readouterr().err  # tyro writes messages of its own
+
+
+def rows_of(terrain, setting, seed, outcomes, **more):
+    trial = asdict(Trial(terrain=terrain, policy=terrain, ground=1, seed=1, outcome="fell"))
+    known = {"trained_on": terrain, "setting": setting, "training_seed": seed, "samples": 1000}
+    return [known | more | trial | {"outcome": outcome} for outcome in outcomes]
+
+
+def test_table_by_hand():
+    rows = [
+        *rows_of("gaps", "0.1", 1, ["reached"] * 4, r_v=0.5, calibration_error=0.02),
+        *rows_of("gaps", "0.1", 5, ["fell", "reached"] * 2, r_v=0.7, calibration_error=0.04),
+        *rows_of("gaps", "0.2", 1, ["fell"] * 4, r_v=0.1, calibration_error=0.0),
+        *rows_of("gaps", "0.2", 5, ["timeout"] * 4, r_v=0.3, calibration_error=0.0),
+    ]
+    assert table(rows, "gamma").splitlines() == [
+        "| terrain | gamma | samples | seed 1 | seed 5 | mean | r_v | calibration error |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| gaps | 0.1 | 1,000 | 100 (51-100) | 50 (15-85) | 75.0 | 0.600 | 0.030 |",
+        "| gaps | 0.2 | 1,000 | 0 (0-49) | 0 (0-49) | 0.0 | 0.200 | 0.000 |",
+    ]
+
+
+def test_cost_by_hand():
+    cost = TrainingCost(trainings=5, samples=5_000_000, seconds=5 * 3600)
+    assert (
+        cost.on(1)
+        == "5 trainings with 5,000,000 samples, at least about 5.0 h on 1 core like this one"
+    )
+    # Five trainings of an hour each take two cores three hours, and eight cores one.
+    assert "about 3.0 h on 2 cores" in cost.on(2) and "about 1.0 h on 8 cores" in cost.on(8)
+
+
+@pytest.mark.slow
+def test_cost_is_measured(config):
+    cost = estimate(replace(config, vary=("iterations", "4", "6")))
+    assert (cost.trainings, cost.samples) == (4, 2 * (4 + 6) * 4 * 8)
+    assert 0 < cost.seconds < 60
+    assert not config.folder.exists()  # nothing of it is kept
+
+
+@pytest.mark.slow
+def test_a_sweep_leaves_specialists_and_a_report(whole, capsys):
+    rows = json.loads((whole / "rows.json").read_text())
+    assert [(row["training"], row["ground"]) for row in rows] == [
+        ("steps-1", 1),
+        ("steps-1", 3),
+        ("steps-2", 1),
+        ("steps-2", 3),
+    ]
+    assert all(row["samples"] == 6 * 4 * 8 and 0 <= row["r_v"] <= 1 for row in rows)
+    for seed in (1, 2):
+        specialist = load_specialist(whole / f"runs/steps-{seed}/specialist")
+        assert specialist.provenance["seed"] == seed and specialist.provenance["iteration"] == 6
+    text = (whole / "table.md").read_text()
+    assert "| terrain | samples | seed 1 | seed 2 | mean |" in text and "4 trials in all" in text
+    assert (whole / "figures" / "success.svg").read_text().count("<circle") == 2
+    assert json.loads((whole / "run.json").read_text())["settings"]["train"]["iterations"] == 6
+
+
+@pytest.mark.slow
+def test_the_number_of_workers_changes_nothing(whole, config, capsys):
+    assert sweep.run(replace(config, workers=2)) == 0
+    assert same(whole, config.folder)
+    printed = capsys.readouterr().out
+    assert "2 of 2 tasks to do; all of them: 2 trainings with 384 samples" in printed
+    assert f"tensorboard --logdir {config.folder / 'runs'}" in printed
+
+
+# Workers import it, so it lives in a module of its own, on the path.
+KILLED = """
+import os, signal
+from fgtutor.evaluation import sweep
+from fgtutor.training import Trainer
+
+def killed_once(work, trials):
+    if not work.config.folder.exists():
+        iterate = Trainer.iterate
+
+        def dying(trainer):
+            if trainer.iteration == 3:  # after the checkpoint of iteration 2
+                os.kill(os.getpid(), signal.SIGKILL)
+            return iterate(trainer)
+
+        Trainer.iterate = dying
+    return sweep.run_task(work, trials)
+"""
+
+
+@pytest.fixture
+def killed_once(tmp_path, monkeypatch):
+    (tmp_path / "fgtutor_killed.py").write_text(KILLED)
+    monkeypatch.syspath_prepend(tmp_path)
+    # A local Ray cluster's workers find modules through this variable only.
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, sys.path)]))
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # or it writes a token into the home folder
+    yield __import__("fgtutor_killed").killed_once
+    del sys.modules["fgtutor_killed"]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # Ray's own
+@pytest.mark.parametrize("where", [{"workers": 2}, {"ray": "local"}], ids=["processes", "ray"])
+def test_a_killed_worker_costs_no_bit(whole, config, killed_once, where, monkeypatch):
+    if "ray" in where:
+        pytest.importorskip("ray", reason="the extra [cluster] is not installed")
+    monkeypatch.setattr(sweep, "run_task", killed_once)
+    assert sweep.run(replace(config, **{"workers": 0} | where)) == 0
+    assert same(whole, config.folder)
+
+
+@pytest.mark.slow
+def test_interrupted_and_gone_on_is_the_same(whole, config, monkeypatch):
+    iterate = training.Trainer.iterate
+
+    def asked_to_stop(trainer):
+        if trainer.iteration == 3:
+            signal.raise_signal(signal.SIGINT)
+        return iterate(trainer)
+
+    # Its iterations would be interrupted first.
+    cost = TrainingCost(trainings=2, samples=384, seconds=1.0)
+    monkeypatch.setattr(sweep, "estimate", lambda config: cost)
+    monkeypatch.setattr(training.Trainer, "iterate", asked_to_stop)
+    with pytest.raises(KeyboardInterrupt):
+        sweep.run(config)
+    monkeypatch.undo()
+    assert (config.folder / "runs/steps-1/checkpoint.pt").exists()
+    assert not list((config.folder / "shards").iterdir())  # half a training is no result
+    assert sweep.run(config) == 0
+    assert same(whole, config.folder)
+
+
+@pytest.mark.slow
+def test_more_seeds_and_values_in_the_same_folder_train_only_the_new(config, monkeypatch):
+    trained, train = [], training.train
+
+    def noted(config, **more):
+        trained.append(config.out.name)
+        return train(config, **more)
+
+    monkeypatch.setattr(training, "train", noted)
+    config = replace(config, seeds=(1,), trials=1)
+    assert sweep.run(config) == 0
+    assert sweep.run(replace(config, seeds=(1, 2))) == 0
+    assert trained == ["steps-1", "steps-2"]
+    for change in ({"trials": 2}, {"train": replace(TINY, gamma=0.9)}):
+        with pytest.raises(ReportError, match="other settings"):
+            sweep.run(replace(config, **change))
+
+
+@pytest.mark.slow
+def test_parts_merge_to_the_same_rows(whole, config, tmp_path, capsys):
+    parts = [replace(config, out=tmp_path / f"part{k}", part=(k, 2)) for k in (1, 2)]
+    for part in parts:
+        assert sweep.run(part) == 0
+    assert "1 of 2 tasks done" in capsys.readouterr().out
+    assert sweep.run(replace(config, merge=tuple(part.folder for part in parts))) == 0
+    assert (config.folder / "rows.json").read_bytes() == (whole / "rows.json").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_generalist_crosses_every_kind(config):
+    config = replace(config, terrains=("general",), seeds=(1,), trials=5)
+    ((_, result),) = run_tasks(make_tasks(config), workers=1)
+    assert [row["terrain"] for row in result.rows] == ["steps", "gaps", "slopes", "rubble", "steps"]
+    assert {row["policy"] for row in result.rows} == {"general"}
+
+
+@pytest.mark.slow
+def test_a_training_that_cannot_go_on_is_named(config):
+    (work, _) = trainings(config)
+    training.train(replace(work.config, gamma=0.5, iterations=2), progress=False)
+    with pytest.raises(EvaluationError, match=r"training steps-1: .*gamma was 0.5") as caught:
+        sweep.run_task(work, 1)
+    assert isinstance(caught.value.__cause__, CheckpointError)
