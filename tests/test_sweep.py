@@ -71,6 +71,9 @@ def test_the_robot_decides_the_sizes():
     assert config_of(["--robot", "a1"])().train == A1TrainConfig()
     assert config_of(["--seeds", "1"])().train == TrainConfig()
     assert A1SweepConfig().robot == "a1"
+    # One that has no sizes of its own takes the toy's, as `fgtutor train` does.
+    (work, *_) = trainings(SweepConfig(robot="a1"))
+    assert work.config == TrainConfig(robot="a1", seed=1, out=work.config.out)
 
 
 def test_every_terrain_value_and_seed_is_a_training(config, tmp_path):
@@ -122,7 +125,7 @@ def test_a_task_takes_the_cores_and_the_gpu_of_its_training(config):
         ({"train": TrainConfig(resume=True)}, "goes on by itself"),
         ({"train": TrainConfig(hours=1.0)}, "train.iterations"),
         ({"train": TrainConfig(out=Path("x"))}, "use --out"),
-        ({"train": TrainConfig(robot="a1")}, "use --robot"),
+        ({"train": TrainConfig(robot="a1")}, "sets robot .* use --robot"),
         ({"vary": ("gamma",)}, "nothing to vary gamma by"),
         ({"vary": ("seed", "1", "2")}, "varies seed in its own way"),
     ],

@@ -83,9 +83,9 @@ class SweepConfig(RunConfig):
             raise ConfigError("trainings keep their checkpoints in a folder: give --out FOLDER")
         if self.trials < 1 or not self.seeds:
             raise ConfigError(f"need trials >= 1 and a seed, got {self.trials} and {self.seeds}")
-        shared, default = asdict(self.train), asdict(type(self.train)(robot=self.robot))
+        untouched = type(self.train)()
         for name, instead in OURS_TO_SET.items():
-            if shared[name] != default[name]:
+            if getattr(self.train, name) not in (getattr(untouched, name), self.robot):
                 raise ConfigError(f"a sweep sets {name} of its trainings: use {instead}")
         if len(self.vary) == 1:
             raise ConfigError(f"nothing to vary {self.vary[0]} by: give its values too")
@@ -150,6 +150,7 @@ def _training(config: SweepConfig, terrain: str, option: str, value: str, seed: 
     start = config.train.start_from
     own = replace(
         config.train,
+        robot=config.robot,
         terrain=terrain,
         seed=seed,
         out=config.folder / RUNS / name,
@@ -330,7 +331,7 @@ def run(config: SweepConfig) -> int:
 def _settings(config: SweepConfig) -> dict[str, Any]:
     """Return what a training's crossings depend on, but for what tells the trainings apart."""
     shared = comparable(config.train)
-    del shared["terrain"], shared["seed"]
+    del shared["robot"], shared["terrain"], shared["seed"]
     return settings_of(
         config,
         COMMAND,
