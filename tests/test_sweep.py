@@ -109,9 +109,12 @@ def test_by_default_the_robots_own_terrains(config):
 
 
 def test_a_task_takes_the_cores_and_the_gpu_of_its_training(config):
-    assert [(task.cores, task.gpus) for task in make_tasks(config)] == [(1, 0)] * 2
-    large = replace(config, train=replace(TINY, threads=4, device="cuda:0"))
-    assert [(task.cores, task.gpus) for task in make_tasks(large)] == [(4, 1)] * 2
+    def takes(config):
+        return [(task.cores, task.gpus) for task in make_tasks(trainings(config), 1)]
+
+    assert takes(config) == [(1, 0)] * 2
+    large = replace(TINY, threads=4, device="cuda:0")
+    assert takes(replace(config, train=large)) == [(4, 1)] * 2
 
 
 @pytest.mark.parametrize(
@@ -188,7 +191,7 @@ def test_cost_by_hand():
 
 @pytest.mark.slow
 def test_cost_is_measured(config):
-    cost = estimate(replace(config, vary=("iterations", "4", "6")))
+    cost = estimate(trainings(replace(config, vary=("iterations", "4", "6"))))
     assert (cost.trainings, cost.samples) == (4, 2 * (4 + 6) * 4 * 8)
     assert 0 < cost.seconds < 60
     assert not config.folder.exists()  # nothing of it is kept
@@ -214,10 +217,12 @@ def test_a_sweep_leaves_specialists_and_a_report(whole, capsys):
 
 
 @pytest.mark.slow
-def test_the_number_of_workers_changes_nothing(whole, config, capsys):
+def test_the_number_of_workers_changes_nothing(whole, config, capsys, monkeypatch):
+    monkeypatch.setattr(sweep, "WATCH_SECONDS", 0.01)
     assert sweep.run(replace(config, workers=2)) == 0
     assert same(whole, config.folder)
-    printed = capsys.readouterr().out
+    printed, bars = capsys.readouterr()
+    assert "| 12/12 [" in bars  # iterations, as they came
     assert "2 of 2 tasks to do; all of them: 2 trainings with 384 samples" in printed
     assert f"tensorboard --logdir {config.folder / 'runs'}" in printed
 
@@ -275,7 +280,7 @@ def test_interrupted_and_gone_on_is_the_same(whole, config, monkeypatch):
 
     # Its iterations would be interrupted first.
     cost = TrainingCost(trainings=2, samples=384, seconds=1.0)
-    monkeypatch.setattr(sweep, "estimate", lambda config: cost)
+    monkeypatch.setattr(sweep, "estimate", lambda works: cost)
     monkeypatch.setattr(training.Trainer, "iterate", asked_to_stop)
     with pytest.raises(KeyboardInterrupt):
         sweep.run(config)
@@ -317,7 +322,7 @@ def test_parts_merge_to_the_same_rows(whole, config, tmp_path, capsys):
 @pytest.mark.slow
 def test_a_generalist_crosses_every_kind(config):
     config = replace(config, terrains=("general",), seeds=(1,), trials=5)
-    ((_, result),) = run_tasks(make_tasks(config), workers=1)
+    ((_, result),) = run_tasks(make_tasks(trainings(config), config.trials), workers=1)
     assert [row["terrain"] for row in result.rows] == ["steps", "gaps", "slopes", "rubble", "steps"]
     assert {row["policy"] for row in result.rows} == {"general"}
 

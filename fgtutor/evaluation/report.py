@@ -17,6 +17,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -86,9 +87,11 @@ def run_and_report(
     settings: dict[str, Any],
     cost: Callable[[], Estimate],
     find: Callable[[list[Row]], Findings],
+    watched: AbstractContextManager[None] | None = None,
 ) -> int:
     """Say what an evaluation will cost, do what is left of it, print and keep what it found.
 
+    `watched` surrounds the tasks, to show more of them than how many are done.
     Returns the exit status of its command, 0. Raises what `collect` and `write_report` raise.
     """
     began = time.time()
@@ -97,7 +100,8 @@ def run_and_report(
         # How many cores a cluster will give is not known before it does.
         cores = 1 if config.ray else config.workers or os.cpu_count() or 1
         print(f"{left} of {len(tasks)} tasks to do; all of them: {cost().on(cores)}", flush=True)
-    run = collect(tasks, settings, config, progress=True)
+    with watched or nullcontext():
+        run = collect(tasks, settings, config, progress=True)
     if not run.complete:
         print(f"{run}; give the other parts' folders to --merge for the table")
         return 0

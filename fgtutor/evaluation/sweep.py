@@ -12,6 +12,7 @@ import io
 import math
 import os
 import re
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import tyro
+from tqdm import tqdm
 
 from fgtutor import training
 from fgtutor.baselines import single
@@ -45,6 +47,8 @@ from fgtutor.training import CHECKPOINT, Trainer
 COMMAND = "sweep"
 RUNS = "runs"
 """Where in the report folder the run folders lie."""
+WATCH_SECONDS = 10.0
+"""How often to look how far they are, s."""
 OURS_TO_SET = {
     "robot": "--robot",
     "terrain": "--terrains",
@@ -214,17 +218,17 @@ def _tracking(specialist: Specialist, kinds: Sequence[str], envs: int) -> dict[s
     return {"r_v": round(float(measured.mean()), 4), "calibration_error": round(error, 4)}
 
 
-def make_tasks(config: SweepConfig) -> list[Task]:
+def make_tasks(works: Sequence[Training], trials: int) -> list[Task]:
     """Return a task a training, with the cores and the GPU that it takes."""
     return [
         Task(
             name=each.name,
             function=run_task,
-            arguments=(each, config.trials),
+            arguments=(each, trials),
             cores=each.config.threads,
             gpus=int(each.config.device.startswith("cuda")),
         )
-        for each in trainings(config)
+        for each in works
     ]
 
 
@@ -247,13 +251,13 @@ class TrainingCost:
         )
 
 
-def estimate(config: SweepConfig) -> TrainingCost:
+def estimate(works: Sequence[Training]) -> TrainingCost:
     """Measure the second iteration of the first training, and work out what all of them take."""
-    works = [each.config for each in trainings(config)]
-    trainer = Trainer(works[0])
+    configs = [each.config for each in works]
+    trainer = Trainer(configs[0])
     first, second = (trainer.iterate()["seconds"] for _ in range(2))
-    samples = sum(work.iterations * work.num_envs * work.steps for work in works)
-    per_sample = (second - first) / (works[0].num_envs * works[0].steps)
+    samples = sum(config.iterations * config.num_envs * config.steps for config in configs)
+    per_sample = (second - first) / (configs[0].num_envs * configs[0].steps)
     return TrainingCost(trainings=len(works), samples=samples, seconds=samples * per_sample)
 
 
@@ -316,16 +320,47 @@ def run(config: SweepConfig) -> int:
             figures={"success.svg": partial(Path.write_text, data=chart)},
         )
 
-    tasks = make_tasks(config)
+    works = trainings(config)
+    settings = _settings(config)
     print(f"the curves, while they train: tensorboard --logdir {config.folder / RUNS}")
     return report.run_and_report(
         replace(config, workers=workers),
         title=title,
-        tasks=tasks,
-        settings=_settings(config),
-        cost=partial(estimate, config),
+        tasks=make_tasks(works, config.trials),
+        settings=settings,
+        cost=partial(estimate, works),
         find=find,
+        watched=_watched([work.config for work in works]),
     )
+
+
+@contextlib.contextmanager
+def _watched(runs: Sequence[TrainConfig]) -> Iterator[None]:
+    """Show how far the trainings are, wherever they run, by the snapshots in their run folders."""
+    over = threading.Event()
+
+    def watch() -> None:
+        ended = over.wait(WATCH_SECONDS)
+        if ended:  # nothing was left to train
+            return
+        with tqdm(total=sum(run.iterations for run in runs), unit="it", desc="trained") as bar:
+            while not ended:
+                ended = over.wait(WATCH_SECONDS)
+                bar.n = sum(_iteration(run.folder) for run in runs)
+                bar.refresh()
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()
+
+
+def _iteration(folder: Path) -> int:
+    """Return the iteration of the last snapshot in a run folder, or 0."""
+    return max((int(path.name) for path in folder.glob("snapshots/[0-9]*")), default=0)
 
 
 def _settings(config: SweepConfig) -> dict[str, Any]:
