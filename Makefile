@@ -1,4 +1,5 @@
-# Every target installs what it needs into .venv first; nothing outside this folder is touched.
+# Every target installs what it needs into .venv first; nothing outside this folder is
+# touched, but for a browser that `make test` installs where it is root and finds none.
 #   make demo       plan and drive a mixed terrain with the shipped A1 specialists; writes demo/
 #   make test       every test          make test-fast  those that take under a minute together
 #   make lab        JupyterLab on the first notebook, on this machine only

@@ -112,11 +112,6 @@ class TrainConfig:
         for name in ("label_seconds", "hours", "critic_warmup"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must be 0 or more, got {getattr(self, name)}")
-        if self.start_from and self.start_from.resolve().is_relative_to(self.folder.resolve()):
-            raise ConfigError(
-                f"{self.folder} would be overwritten by the run that starts from it: give another "
-                "--out, or go on with --resume and without --from"
-            )
         for name, what in (("easiest", "difficulty"), ("neighbours", "share")):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be a {what} from 0 to 1, got {getattr(self, name)}")

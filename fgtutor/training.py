@@ -42,7 +42,7 @@ from fgtutor.recipe import (
 )
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.specialist import Specialist, load_specialist, save_specialist
-from fgtutor.storage import atomic_write, make_folder
+from fgtutor.storage import atomic_write, make_folder, storage_error
 
 __all__ = ["A1TrainConfig", "TrainConfig", "Trainer", "config_of", "run", "train", "training_world"]
 
@@ -59,6 +59,12 @@ class Trainer:
 
     def __init__(self, config: TrainConfig) -> None:
         """Build the world, the robots and the learner; nothing is simulated yet."""
+        start = config.start_from
+        if start and start.resolve().is_relative_to(config.folder.resolve()):
+            raise ConfigError(
+                f"{config.folder} would be overwritten by the run that starts from it: give "
+                "another --out, or go on with --resume and without --from"
+            )
         self.config = config
         self.iteration = 0
         self.easiest = config.easiest
@@ -229,7 +235,7 @@ class Trainer:
         self.env = self.runner.env = self._make_env()
         self.env.load_state_dict(state)
         self.env.reset_all()
-        _give_back_memory()
+        give_back_memory()
 
     def resume(self) -> None:
         """Continue from the run folder's checkpoint, to more iterations if `config` says so.
@@ -300,7 +306,7 @@ class Trainer:
         )
 
 
-def _give_back_memory() -> None:
+def give_back_memory() -> None:
     """Ask glibc, where there is one, to return to the system what the last world has freed.
 
     It keeps freed pieces between others still in use: 0.4 GB for each world of 640 A1s.
@@ -325,19 +331,31 @@ def train(
     config: TrainConfig,
     *,
     on_iteration: Callable[[dict[str, float]], None] | None = None,
-    progress: bool = True,
+    attended: bool = True,
 ) -> Specialist:
     """Train one specialist; write its folder to `<run>/specialist` and return it.
 
-    Shows a progress bar with the time left, unless `progress` is off. Ctrl-C saves a checkpoint and
-    returns what has been learned; `config.resume` continues. `on_iteration` gets each iteration's
-    numbers (the notebooks draw them).
+    Shows a progress bar with the time left. Ctrl-C saves a checkpoint and returns what has been
+    learned; `config.resume` continues. `on_iteration` gets each iteration's numbers (the notebooks
+    draw them).
+
+    A run that nobody attends has no bar, and Ctrl-C is not its own: it ends where it is and resumes
+    from its last checkpoint as if nothing had been. (A checkpoint moves the run to other ground, so
+    one that Ctrl-C asks for makes another run of it.)
+
+    Raises:
+        ConfigError: The settings do not fit each other.
+        CheckpointError: There is nothing to resume or to start from, or it does not fit.
+        StorageError: The run folder cannot be written; its last checkpoint is whole.
     """
     with distributed.leave_at_end():
         trainer = Trainer(config)
         if config.resume:
             trainer.resume()
-        _iterate(trainer, on_iteration, progress)
+        try:
+            _iterate(trainer, on_iteration, attended)
+        except OSError as error:  # of the curves: tensorboard raises what the system does
+            raise storage_error(config.folder, error) from error
         specialist = trainer.specialist()
         if leads():
             save_specialist(specialist, config.folder / "specialist")
@@ -345,7 +363,7 @@ def train(
 
 
 def _iterate(
-    trainer: Trainer, on_iteration: Callable[[dict[str, float]], None] | None, progress: bool
+    trainer: Trainer, on_iteration: Callable[[dict[str, float]], None] | None, attended: bool
 ) -> None:
     """Train to the end, to the time limit or to a Ctrl-C, and leave a checkpoint."""
     from torch.utils.tensorboard import SummaryWriter
@@ -361,9 +379,9 @@ def _iterate(
             total=config.iterations,
             initial=trainer.iteration,
             unit="it",
-            disable=not (progress and leads()),
+            disable=not (attended and leads()),
         ) as bar,
-        stop_on_interrupt() as stopped,
+        stop_on_interrupt() if attended else contextlib.nullcontext(lambda: False) as stopped,
     ):
         bar.set_description(f"{config.robot} {config.terrain}")
         while trainer.iteration < config.iterations:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from fgtutor import __main__ as cli
 from fgtutor import training
 from fgtutor.errors import (
     CheckpointError,
@@ -16,6 +17,7 @@ from fgtutor.errors import (
     EvaluationError,
     ReportError,
     SpecialistError,
+    StorageError,
     TerrainError,
 )
 from fgtutor.evaluation import sweep
@@ -76,6 +78,19 @@ def test_the_robot_decides_the_sizes():
     assert work.config == TrainConfig(robot="a1", seed=1, out=work.config.out)
 
 
+@pytest.mark.parametrize("words", [["--train.terrain", "steps"], ["--train.seed=1"]])
+def test_what_the_sweep_sets_is_refused_even_as_the_default(words, capsys):
+    assert cli.main(["sweep", *words]) == cli.USAGE
+    assert "of its trainings: use --" in capsys.readouterr().err
+
+
+def test_it_starts_from_where_a_training_would_write_by_default(config, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    start = TrainConfig(start_from=Path("runs/toy-steps/specialist"))
+    (work, _) = trainings(replace(config, train=start))
+    assert work.config.start_from == tmp_path / "runs/toy-steps/specialist"
+
+
 def test_every_terrain_value_and_seed_is_a_training(config, tmp_path):
     config = replace(
         config, terrains=("steps", "gaps"), vary=("learning-rate", "1e-3", "5e-4"), seeds=(3, 4)
@@ -130,7 +145,8 @@ def test_a_task_takes_the_cores_and_the_gpu_of_its_training(config):
         ({"train": TrainConfig(out=Path("x"))}, "use --out"),
         ({"train": TrainConfig(robot="a1")}, "sets robot .* use --robot"),
         ({"vary": ("gamma",)}, "nothing to vary gamma by"),
-        ({"vary": ("seed", "1", "2")}, "varies seed in its own way"),
+        ({"vary": ("seed", "1", "2")}, "sets seed .* use --seeds"),
+        ({"vary": ("from", "a", "b")}, "a sweep for each --train.from"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(config, changes, message):
@@ -143,9 +159,9 @@ def test_settings_that_cannot_work_are_refused(config, changes, message):
     [
         ({"seeds": (1, 1)}, ConfigError, "asked twice for steps-1"),
         ({"vary": ("gamma", "0.9", "0.9")}, ConfigError, "asked twice"),
-        ({"vary": ("speed", "1")}, ConfigError, "no --speed 1: .*fgtutor train --help"),
-        ({"vary": ("gamma", "much")}, ConfigError, "no --gamma much"),
-        ({"vary": ("iterations", "0")}, ConfigError, "no --iterations 0"),
+        ({"vary": ("speed", "1")}, ConfigError, "--speed 1 .*no such option.*fgtutor train --help"),
+        ({"vary": ("gamma", "much")}, ConfigError, "--gamma much .*could not convert string to"),
+        ({"vary": ("iterations", "0")}, ConfigError, "iterations must be at least 1, got 0"),
         ({"terrains": ("moon",)}, TerrainError, "moon"),
         ({"robot": "horse", "train": TrainConfig(robot="horse")}, ConfigError, "horse"),
         ({"train": replace(TINY, start_from=Path("nobody"))}, SpecialistError, "nobody holds no"),
@@ -189,6 +205,20 @@ def test_cost_by_hand():
     assert "about 3.0 h on 2 cores" in cost.on(2) and "about 1.0 h on 8 cores" in cost.on(8)
 
 
+def test_a_value_that_fits_no_training_is_told_before_any(config):
+    config = replace(config, vary=("steps", "8", "1"))
+    with pytest.raises(ConfigError, match="rollouts of 1 steps never see half"):
+        sweep.run(config)
+    assert not list(config.folder.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_is_told_at_once(config, monkeypatch):
+    monkeypatch.setattr(sweep, "estimate", lambda works: pytest.fail("this takes a while"))
+    config.folder.write_text("in the way")
+    with pytest.raises(StorageError, match=r"cannot write .*/sweep: "):
+        sweep.run(config)
+
+
 @pytest.mark.slow
 def test_cost_is_measured(config):
     cost = estimate(trainings(replace(config, vary=("iterations", "4", "6"))))
@@ -213,7 +243,7 @@ def test_a_sweep_leaves_specialists_and_a_report(whole, capsys):
     text = (whole / "table.md").read_text()
     assert "| terrain | samples | seed 1 | seed 2 | mean |" in text and "4 trials in all" in text
     assert (whole / "figures" / "success.svg").read_text().count("<circle") == 2
-    assert json.loads((whole / "run.json").read_text())["settings"]["train"]["iterations"] == 6
+    assert json.loads((whole / "run.json").read_text())["settings"]["train.iterations"] == 6
 
 
 @pytest.mark.slow
@@ -239,6 +269,7 @@ def killed_once(work, trials):
 
         def dying(trainer):
             if trainer.iteration == 3:  # after the checkpoint of iteration 2
+                (work.config.folder / "died").touch()
                 os.kill(os.getpid(), signal.SIGKILL)
             return iterate(trainer)
 
@@ -266,6 +297,7 @@ def test_a_killed_worker_costs_no_bit(whole, config, killed_once, where, monkeyp
         pytest.importorskip("ray", reason="the extra [cluster] is not installed")
     monkeypatch.setattr(sweep, "run_task", killed_once)
     assert sweep.run(replace(config, **{"workers": 0} | where)) == 0
+    assert all((config.folder / f"runs/steps-{seed}/died").exists() for seed in (1, 2))
     assert same(whole, config.folder)
 
 
@@ -274,7 +306,7 @@ def test_interrupted_and_gone_on_is_the_same(whole, config, monkeypatch):
     iterate = training.Trainer.iterate
 
     def asked_to_stop(trainer):
-        if trainer.iteration == 3:
+        if trainer.iteration == 4:  # the next checkpoint is due after two more
             signal.raise_signal(signal.SIGINT)
         return iterate(trainer)
 
@@ -285,7 +317,7 @@ def test_interrupted_and_gone_on_is_the_same(whole, config, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         sweep.run(config)
     monkeypatch.undo()
-    assert (config.folder / "runs/steps-1/checkpoint.pt").exists()
+    assert (config.folder / "runs/steps-1/snapshots/4").exists()
     assert not list((config.folder / "shards").iterdir())  # half a training is no result
     assert sweep.run(config) == 0
     assert same(whole, config.folder)
@@ -304,9 +336,12 @@ def test_more_seeds_and_values_in_the_same_folder_train_only_the_new(config, mon
     assert sweep.run(config) == 0
     assert sweep.run(replace(config, seeds=(1, 2))) == 0
     assert trained == ["steps-1", "steps-2"]
-    for change in ({"trials": 2}, {"train": replace(TINY, gamma=0.9)}):
-        with pytest.raises(ReportError, match="other settings"):
-            sweep.run(replace(config, **change))
+    snapshots = sorted(config.folder.glob("runs/*/snapshots/*"))
+    assert sweep.run(replace(config, trials=3)) == 0  # crosses again, but trains no more
+    assert len(json.loads((config.folder / "rows.json").read_text())) == 3
+    assert sorted(config.folder.glob("runs/*/snapshots/*")) == snapshots
+    with pytest.raises(ReportError, match=r"other settings \(train.gamma was 0.98 and is 0.9\)"):
+        sweep.run(replace(config, train=replace(TINY, gamma=0.9)))
 
 
 @pytest.mark.slow
@@ -330,7 +365,7 @@ def test_a_generalist_crosses_every_kind(config):
 @pytest.mark.slow
 def test_a_training_that_cannot_go_on_is_named(config):
     (work, _) = trainings(config)
-    training.train(replace(work.config, gamma=0.5, iterations=2), progress=False)
+    training.train(replace(work.config, gamma=0.5, iterations=2), attended=False)
     with pytest.raises(EvaluationError, match=r"training steps-1: .*gamma was 0.5") as caught:
         sweep.run_task(work, 1)
     assert isinstance(caught.value.__cause__, CheckpointError)

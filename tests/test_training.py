@@ -1,4 +1,5 @@
 import dataclasses
+import errno
 import json
 import os
 import shutil
@@ -258,7 +259,7 @@ def test_a_resumed_run_knows_what_it_started_from_and_goes_on_beyond_its_end(tra
 @pytest.mark.parametrize("part", ["", "specialist", "snapshots/25"])
 def test_a_run_does_not_overwrite_what_it_starts_from(tmp_path, part):
     with pytest.raises(ConfigError, match=r"would be overwritten .* give another --out"):
-        TrainConfig(out=tmp_path, start_from=tmp_path / part)
+        Trainer(TrainConfig(out=tmp_path, start_from=tmp_path / part))
 
 
 def test_starting_from_another_robots_policy_is_refused(trained, tmp_path):
@@ -332,6 +333,15 @@ def test_an_unreadable_checkpoint_says_what_to_do(trained, tmp_path, damage):
         )
     with pytest.raises(CheckpointError, match=r"checkpoint\.pt|--resume"):
         train(TrainConfig(out=tmp_path, resume=True, **TINY))
+
+
+def test_a_disk_that_is_full_for_the_curves_is_a_storage_error(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter.add_scalar", full)
+    with pytest.raises(StorageError, match="No space left on device; free some disk space"):
+        train(TrainConfig(out=tmp_path / "run", **TINY))
 
 
 def test_a_run_folder_that_cannot_be_made_is_a_storage_error(tmp_path):

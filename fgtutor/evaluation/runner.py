@@ -215,7 +215,8 @@ def _on_processes(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, R
                     continue
                 yield task, _unwrap(task, outcome)
     finally:
-        for worker in team:
+        # Whoever is at work first: the others take their leave, and meanwhile it would go on.
+        for worker in sorted(team, key=lambda worker: worker.task is None):
             worker.stop()
 
 
@@ -224,8 +225,9 @@ def _on_ray(tasks: Sequence[Task], address: str) -> Iterator[tuple[Task, Result]
         ray = import_module("ray")
     except ImportError as error:
         raise MissingExtraError(
-            "running on a cluster needs Ray, which is not installed here: "
-            'pip install "fgtutor[cluster]", or leave out --ray to use this machine\'s cores'
+            "running on a cluster needs Ray, which is not installed here: in the clone of fgtutor "
+            'pip install -c constraints.txt -e ".[cluster]", or leave out --ray to use this '
+            "machine's cores"
         ) from error
     try:
         ray.init(address=address, log_to_driver=False)

@@ -15,7 +15,7 @@ import json
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -24,6 +24,7 @@ from fgtutor.errors import ConfigError, ReportError
 from fgtutor.evaluation.runner import Result, Row, Task, run_tasks
 from fgtutor.storage import make_folder, write_json
 
+T = TypeVar("T")
 SETTINGS, SHARDS = "settings.json", "shards"
 
 
@@ -116,7 +117,7 @@ def collect(
         FgtutorError: What `run_tasks` raises.
     """
     done = finished(tasks, settings, config)
-    left = [task for task in _part(tasks, config) if task.name not in done]
+    left = [task for task in part_of(tasks, config) if task.name not in done]
     if config.out:
         _open(config.out, settings)
         for task in tasks:  # what came from elsewhere
@@ -156,7 +157,7 @@ def finished(
     return done
 
 
-def _part(tasks: Sequence[Task], config: RunConfig) -> Sequence[Task]:
+def part_of(tasks: Sequence[T], config: RunConfig) -> Sequence[T]:
     """Take every n-th task: neighbours resemble each other in cost, so the parts do too."""
     which, of = config.part
     return tasks[which - 1 :: of]

@@ -34,15 +34,16 @@ from fgtutor.evaluation.cost import on_cores
 from fgtutor.evaluation.metrics import calibration as compare
 from fgtutor.evaluation.report import Findings, Share, markdown
 from fgtutor.evaluation.runner import Row, Task
-from fgtutor.evaluation.shards import RunConfig, settings_of
+from fgtutor.evaluation.shards import RunConfig, part_of, settings_of
 from fgtutor.evaluation.success import TrialsConfig, cut, make_ground
 from fgtutor.evaluation.trials import drive
 from fgtutor.recipe import A1TrainConfig, TrainConfig, comparable
 from fgtutor.recipe import config_of as recipe_of
 from fgtutor.robots import env_class
-from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist
+from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist
+from fgtutor.storage import make_folder
 from fgtutor.terrain import SCALES
-from fgtutor.training import CHECKPOINT, Trainer
+from fgtutor.training import CHECKPOINT, Trainer, give_back_memory
 
 COMMAND = "sweep"
 RUNS = "runs"
@@ -55,9 +56,9 @@ OURS_TO_SET = {
     "seed": "--seeds",
     "out": "--out",
     "resume": "the same command, which goes on by itself",
-    "hours": "--train.iterations, since a table may not depend on a machine's speed",
+    "hours": "--train.iterations, since a table must not depend on a machine's speed",
 }
-"""Settings of a training that a sweep sets, and what to say instead."""
+"""Settings of a training that a sweep sets, and what to use instead."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +67,8 @@ class SweepConfig(RunConfig):
 
     out: Path | None = Path("runs/sweep")
     """Report folder, with a run folder a training in `runs`. The same command goes on from there;
-    with more terrains, seeds or values only the new ones are trained."""
+    with more terrains, seeds or values only the new ones are trained, and with other `trials`
+    none."""
     robot: str = "toy"
     """Which robot."""
     terrains: tuple[str, ...] = ()
@@ -87,14 +89,19 @@ class SweepConfig(RunConfig):
             raise ConfigError("trainings keep their checkpoints in a folder: give --out FOLDER")
         if self.trials < 1 or not self.seeds:
             raise ConfigError(f"need trials >= 1 and a seed, got {self.trials} and {self.seeds}")
-        untouched = type(self.train)()
-        for name, instead in OURS_TO_SET.items():
-            if getattr(self.train, name) not in (getattr(untouched, name), self.robot):
-                raise ConfigError(f"a sweep sets {name} of its trainings: use {instead}")
+        untouched = replace(type(self.train)(), robot=self.train.robot)
+        for name in OURS_TO_SET:
+            if getattr(self.train, name) != getattr(untouched, name):
+                raise _set_elsewhere(name)
+        if self.train.robot not in (self.robot, type(self.train)().robot):
+            raise _set_elsewhere("robot")
         if len(self.vary) == 1:
             raise ConfigError(f"nothing to vary {self.vary[0]} by: give its values too")
-        if self.vary and self.vary[0].replace("-", "_") in OURS_TO_SET:
-            raise ConfigError(f"a sweep varies {self.vary[0]} in its own way: see --help")
+        name = self.vary[0].replace("-", "_") if self.vary else ""
+        if name in OURS_TO_SET:
+            raise _set_elsewhere(name)
+        if name in ("from", "start_from"):
+            raise ConfigError("all trainings of a sweep start alike: a sweep for each --train.from")
 
     @property
     def folder(self) -> Path:
@@ -111,8 +118,19 @@ class A1SweepConfig(SweepConfig):
 
 
 def config_of(words: Sequence[str]) -> type[SweepConfig]:
-    """Return the config class for command line `words`, which may hold `--robot NAME`."""
+    """Return the config class for command line `words`, which may hold `--robot NAME`.
+
+    Raises `ConfigError` if they set what the sweep itself sets, were it to the default.
+    """
+    for word in words:
+        name = word.partition("=")[0].removeprefix("--train.").replace("-", "_")
+        if word.startswith("--train.") and name in OURS_TO_SET:
+            raise _set_elsewhere(name)
     return A1SweepConfig if recipe_of(words) is A1TrainConfig else SweepConfig
+
+
+def _set_elsewhere(name: str) -> ConfigError:
+    return ConfigError(f"a sweep sets {name} of its trainings: use {OURS_TO_SET[name]}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,8 +188,10 @@ def _with(config: TrainConfig, option: str, value: str) -> TrainConfig:
         with contextlib.redirect_stderr(said):
             return tyro.cli(type(config), args=words, default=config, console_outputs=False)
     except SystemExit as error:
+        lines = (line.strip("│ ") for line in said.getvalue().splitlines() if "│" in line)
+        why = next(lines, "there is no such option")
         raise ConfigError(
-            f"a training has no {' '.join(words)}: `fgtutor train --help` lists what it takes"
+            f"cannot train with {' '.join(words)} ({why}): `fgtutor train --help` says what can be"
         ) from error
 
 
@@ -179,12 +199,14 @@ def run_task(work: Training, trials: int) -> list[Row]:
     """Do one task: train, or go on where a worker was lost, then cross held-out terrain."""
     resume = (work.config.folder / CHECKPOINT).exists()
     try:
-        specialist = training.train(replace(work.config, resume=resume), progress=False)
-        if specialist.provenance["iteration"] < work.config.iterations:
-            raise KeyboardInterrupt  # which training took as a wish to stop, and saved
-        return _crossings(work, specialist, trials)
+        training.train(replace(work.config, resume=resume), attended=False)
+        # As a zoo would: on the CPU, wherever it was trained.
+        return _crossings(work, load_specialist(work.config.folder / "specialist"), trials)
     except FgtutorError as error:
-        raise EvaluationError(f"training {work.name}: {error}") from error
+        raise EvaluationError(
+            f"training {work.name}: {error} (the others are kept: correct this, or leave it out, "
+            "and run again)"
+        ) from error
 
 
 def _crossings(work: Training, specialist: Specialist, trials: int) -> list[Row]:
@@ -222,7 +244,7 @@ def make_tasks(works: Sequence[Training], trials: int) -> list[Task]:
     """Return a task a training, with the cores and the GPU that it takes."""
     return [
         Task(
-            name=each.name,
+            name=f"{each.name}-crossed-{trials}",
             function=run_task,
             arguments=(each, trials),
             cores=each.config.threads,
@@ -234,7 +256,7 @@ def make_tasks(works: Sequence[Training], trials: int) -> list[Task]:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingCost:
-    """What the trainings take, if all stay as fast as the first one begins."""
+    """What the trainings take, if all stay as fast as they begin."""
 
     trainings: int
     samples: int
@@ -246,19 +268,28 @@ class TrainingCost:
         """Say it, for a number of trainings at a time."""
         rounds = math.ceil(self.trainings / cores)
         return (
-            f"{self.trainings} trainings with {self.samples:,} samples, at least "
-            f"{on_cores(self.seconds / self.trainings * rounds * cores, cores)}"
+            f"{self.trainings} training{'s' * (self.trainings > 1)} with {self.samples:,} samples, "
+            f"at least {on_cores(self.seconds / self.trainings * rounds * cores, cores)}"
         )
 
 
 def estimate(works: Sequence[Training]) -> TrainingCost:
-    """Measure the second iteration of the first training, and work out what all of them take."""
-    configs = [each.config for each in works]
-    trainer = Trainer(configs[0])
-    first, second = (trainer.iterate()["seconds"] for _ in range(2))
-    samples = sum(config.iterations * config.num_envs * config.steps for config in configs)
-    per_sample = (second - first) / (configs[0].num_envs * configs[0].steps)
-    return TrainingCost(trainings=len(works), samples=samples, seconds=samples * per_sample)
+    """Measure the second iteration of a training for each value, and work out what all take.
+
+    That is done on the CPU, here: a cluster's GPU may be elsewhere. Raises what a training would if
+    a value does not fit the others, before hours have gone into them.
+    """
+    samples, seconds = 0, 0.0
+    for setting in dict.fromkeys(each.setting for each in works):
+        same = [each.config for each in works if each.setting == setting]
+        trainer = Trainer(replace(same[0], device="cpu"))
+        first, second = (trainer.iterate()["seconds"] for _ in range(2))
+        del trainer  # this process only waits from here on, and a world of A1s is large
+        give_back_memory()
+        size = same[0].num_envs * same[0].steps
+        samples += len(same) * same[0].iterations * size
+        seconds += len(same) * same[0].iterations * (second - first)
+    return TrainingCost(trainings=len(works), samples=samples, seconds=seconds)
 
 
 def _groups(rows: Sequence[Row]) -> Iterator[tuple[tuple[str, str], dict[int, list[Row]]]]:
@@ -303,6 +334,7 @@ def run(config: SweepConfig) -> int:
     # A training's own threads are cores that no other one has.
     workers = config.workers or max(1, (os.cpu_count() or 1) // config.train.threads)
     title = f"Trainings side by side ({config.robot})"
+    iterations = "" if option == "iterations" else f", {config.train.iterations} iterations"
 
     def find(rows: list[Row]) -> Findings:
         groups = {
@@ -316,12 +348,13 @@ def run(config: SweepConfig) -> int:
             table=table(rows, option),
             caption=f"Success in % with 95 % intervals, {config.trials} crossings of held-out "
             f"terrain a training, each with its own plan; r_v and calibration error there are "
-            f"means over the seeds; robot {config.robot}, {config.train.iterations} iterations.",
+            f"means over the seeds; robot {config.robot}{iterations}.",
             figures={"success.svg": partial(Path.write_text, data=chart)},
         )
 
     works = trainings(config)
     settings = _settings(config)
+    make_folder(config.folder)
     print(f"the curves, while they train: tensorboard --logdir {config.folder / RUNS}")
     return report.run_and_report(
         replace(config, workers=workers),
@@ -330,7 +363,7 @@ def run(config: SweepConfig) -> int:
         settings=settings,
         cost=partial(estimate, works),
         find=find,
-        watched=_watched([work.config for work in works]),
+        watched=_watched([work.config for work in part_of(works, config)]),
     )
 
 
@@ -343,10 +376,11 @@ def _watched(runs: Sequence[TrainConfig]) -> Iterator[None]:
         ended = over.wait(WATCH_SECONDS)
         if ended:  # nothing was left to train
             return
-        with tqdm(total=sum(run.iterations for run in runs), unit="it", desc="trained") as bar:
+        total, done = sum(run.iterations for run in runs), _iterations(runs)
+        with tqdm(total=total, initial=done, unit="it", desc="trained") as bar:
             while not ended:
                 ended = over.wait(WATCH_SECONDS)
-                bar.n = sum(_iteration(run.folder) for run in runs)
+                bar.n = _iterations(runs)
                 bar.refresh()
 
     watcher = threading.Thread(target=watch, daemon=True)
@@ -358,22 +392,24 @@ def _watched(runs: Sequence[TrainConfig]) -> Iterator[None]:
         watcher.join()
 
 
-def _iteration(folder: Path) -> int:
-    """Return the iteration of the last snapshot in a run folder, or 0."""
-    return max((int(path.name) for path in folder.glob("snapshots/[0-9]*")), default=0)
+def _iterations(runs: Sequence[TrainConfig]) -> int:
+    """Return the iterations of the last snapshots in the run folders, in all."""
+    snapshots = (run.folder.glob("snapshots/[0-9]*") for run in runs)
+    return sum(max((int(path.name) for path in paths), default=0) for paths in snapshots)
 
 
 def _settings(config: SweepConfig) -> dict[str, Any]:
     """Return what a training's crossings depend on, but for what tells the trainings apart."""
-    shared = comparable(config.train)
-    del shared["robot"], shared["terrain"], shared["seed"]
+    start, shared = config.train.start_from, comparable(config.train)
+    for name in ("robot", "terrain", "seed", "start_from"):
+        del shared[name]
     return settings_of(
         config,
         COMMAND,
-        without=("terrains", "seeds", "vary", "train"),
+        without=("terrains", "seeds", "vary", "trials", "train"),
         vary=config.vary[:1],
-        train=shared,
-        start=_digest(config.train.start_from) if config.train.start_from else None,
+        start=_digest(start) if start else None,
+        **{f"train.{name}": value for name, value in shared.items()},
     )
 
 

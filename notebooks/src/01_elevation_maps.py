@@ -7,10 +7,11 @@
 # - **Needs** this package, nothing else: no robot, no GPU, no network
 # - **If a part is slow** only the first cell is: it loads torch, once
 #
-# A robot that plans its way needs to know the ground before it stands on it. This course follows
-# one idea from here to the end: **ask every policy of the robot, at every place and in every
-# direction, how well it would do there, and plan over the answers.** The question starts with a
-# map.
+# A robot that plans its way needs to know the ground before it stands on it. What moves it is a
+# **policy**: a function, usually a trained network, from what the robot senses to what it does; and
+# a robot may have several. This course follows one idea from here to the end: **ask every policy of
+# the robot, at every place and in every direction, how well it would do there, and plan over the
+# answers.** The question starts with a map.
 
 # %% [markdown]
 # ## A map is a grid of heights

@@ -7,7 +7,7 @@
 # - **Needs** notebook [02](02_a_robot_that_falls.ipynb) for $r_v$; uses shipped specialists, so
 #   nothing of yours must be trained
 # - **If a part is slow** run `%env FGTUTOR_FAST=1` in a new cell at the top: fewer robots, fewer
-#   updates. Every bar can be stopped; the cells after it need it whole, so start it again
+#   updates. You may interrupt a bar, but run its cell to the end before you go on
 #
 # In notebook 02 you saw $r_v$ dip where the ground gets hard. Could one have *known*, from the
 # patch, before going there? A network that knows is half of this course: the **Feasibility-Net**.
@@ -57,7 +57,8 @@ rollout = collect(env, roll, seconds=12.0)
 # 2. A label never reaches into the next episode: the robot was put somewhere else.
 #
 # Work it out by hand on six steps and a window of three. The robot tracks well, then fails in
-# step 4, and is reset.
+# step 4, and is reset. Since a row tells of the step that *led to* its moment, the label of a
+# moment begins one row further on, and the 0.0 of the first row is in no label.
 
 # %%
 from fgtutor.ppo import feasibility_labels
@@ -91,12 +92,16 @@ draw_labels(rollout["tracking"][:, unlucky], label[:, unlucky], valid[:, unlucky
 # ## Two heads, one loss
 #
 # The net reads patch and command and answers twice. An MLP gives the feasibility $\hat f \in [0,
-# 1]$; beside it, an autoencoder squeezes the patch through a narrow latent and rebuilds it
-# (notebook 04 will need that):
+# 1]$; beside it, a variational autoencoder (**VAE**) squeezes the patch through a narrow latent and
+# rebuilds it (notebook 04 will need that):
 #
 # $$
 # \mathcal L = (\hat f - r_v)^2 + \alpha\,(\mathcal L_\text{recon} + \beta\,\mathcal L_\text{KL})
 # $$
+#
+# $\mathcal L_\text{recon}$ says how badly it rebuilds the patch; $\mathcal L_\text{KL}$ keeps its
+# latent near a standard normal distribution, so that it cannot simply memorise. $\alpha = 1$ and
+# $\beta = 0.0005$, the paper's, say how much each counts.
 
 # %%
 from fgtutor.feasibility import FeasibilityNet

@@ -116,7 +116,7 @@ for tail, head, edge in list(graph.out_edges((1, 1), data=True)):
 # %% [markdown]
 # The **cost** of an arrow is $1/\hat F_\text{max}$: a step that nearly certainly works costs
 # little more than 1, one with $F = 0.1$ costs 10, so ten good steps round a bad one are a fair
-# trade. Below `f_min` there is no arrow at all.
+# trade. Below `f_min` (0.1, unless you say otherwise) there is no arrow at all.
 #
 # **Dijkstra's algorithm** finds the cheapest way: always go on from the node that is cheapest to
 # reach so far, and no node need ever be looked at twice.

@@ -42,8 +42,8 @@ draw_route(planned.route, M)
 # ## Go
 #
 # `execute` puts the robot at the start and lets it follow. A **pure pursuit** follower steers for
-# a point a little ahead on the route; the active policy is the one that the route names where the
-# robot is.
+# a point a little ahead on the route; the active policy is the one that the route has named, where
+# the robot is, for three control steps in a row (**hysteresis**: `FollowConfig.hold_steps`).
 
 # %%
 from fgtutor import execute
@@ -174,8 +174,8 @@ draw_rates(rates, title="How well must the robot know where it is?")
 #
 # Finally the question of the paper's Table II, for the toy: each specialist plans and drives on
 # its own; **ours** fuses all four; **general** is one policy that was trained on all terrains
-# with the time that each specialist had; and a classical occupancy grid plans, while our policy
-# map says who drives. Terrain nobody has been trained on, the same for all.
+# with as many samples as one specialist has had; and a classical occupancy grid plans, while our
+# policy map says who drives. Terrain nobody has been trained on, the same for all.
 
 # %%
 from fgtutor.baselines import planners

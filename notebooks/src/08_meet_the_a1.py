@@ -111,7 +111,8 @@ draw_curves(t, {"torque": torques}, title="What it takes", xlabel="time (s)", yl
 # %% [markdown]
 # ## What it feels
 #
-# No robot is told where on earth it is. It feels its own body, with the noise of real sensors:
+# No robot is told where on earth it is. It feels its own body, with the noise of real sensors.
+# (Only its velocity no sensor of the A1 measures: a real robot has to estimate it.)
 
 # %%
 from fgtutor.robots.a1_terms import NOISE, SCAN_GRID
@@ -190,7 +191,7 @@ patch_gallery([scan], SCAN_GRID, ["the scan: what the policy walks by"], columns
 # ## What it is paid for
 #
 # The tracking reward of notebook 02 alone would teach a robot to fling itself forward. So the
-# reward is a sum of a dozen small terms: some earn, some cost. Three robots show it, at the same
+# reward is a sum of eleven small terms: some earn, some cost. Three robots show it, at the same
 # place: one walks by the shipped `steps` policy, one stands, one flails.
 
 # %%
@@ -294,8 +295,9 @@ DriveA1(ground, zoo, render=A1View(ground))
 # %% [markdown]
 # ## What to try
 #
-# - Give `A1Config` half the stiffness (`kp`) and repeat the knee's experiment
-#   (`A1Env(..., model=A1Config(kp=17.0))`). What happens to the gap between target and angle?
+# - Give `A1Config` (of `fgtutor.robots.a1_model`) half the stiffness, `kp`, and repeat the knee's
+#   experiment (`A1Env(..., model=A1Config(kp=17.0))`). What happens to the gap between target and
+#   angle?
 # - In the drive above, put `ground` at difficulty 1.0, or on another terrain. Which policy do you
 #   choose, and can you feel a difference?
 # - Drive backwards (`drive.speed = -0.4`). Was it trained for that? What would its Feasibility-Net

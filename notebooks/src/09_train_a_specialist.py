@@ -18,7 +18,8 @@
 # ## Where the shipped ones come from
 #
 # A specialist's folder holds its weights and its **provenance**: settings, seed, versions, and the
-# training's whole curve.
+# curve of its last stage. The shipped ones have had two to four stages; in the last one even the
+# easiest ground is hard (`docs/a1.md` tells all of it).
 
 # %%
 from fgtutor import load_zoo
@@ -28,8 +29,8 @@ steps = load_zoo("a1")["steps"]
 record = steps.provenance
 
 # %%
-print(f"{record['samples']:,} samples, the walker's that it started from included")
-print(f"{record['seconds'] / 60:.0f} minutes of its own, seed {record['seed']}")
+print(f"{record['samples']:,} samples in all, those of what it started from included")
+print(f"{record['seconds'] / 60:.0f} minutes for the last stage, seed {record['seed']}")
 training_curve(record["curve"])
 
 # %% [markdown]
@@ -89,7 +90,7 @@ print(f"or {A1_EPISODES.stuck_seconds} s without moving {100 * A1_EPISODES.stuck
 # PPO makes actions more likely that turned out *better than expected*. Expected by whom? By the
 # **critic**, a second network that predicts the reward still to come, $V$. The **surprise** of one
 # step is $\delta_t = r_t + \gamma V_{t+1} - V_t$. Take a robot that walks as expected, stumbles a
-# little at one step, and falls a second later:
+# little at one step, and falls half a second later:
 
 # %%
 import numpy as np
@@ -201,8 +202,9 @@ draw_curves(
 )  # fmt: skip
 
 # %% [markdown]
-# *What to see:* the distance between the curves is what walking is worth. All specialists start
-# from this one walker, and learn only what is different about *their* ground.
+# *What to see:* the distance between the curves is what walking is worth. Specialists start from a
+# walker (that of the gaps from the steps specialist), and learn only what is different about
+# *their* ground.
 #
 # ## How long may a step be?
 #
@@ -223,8 +225,8 @@ draw_curves(
 # %% [markdown]
 # ## The exam
 #
-# Curves are homework; this is the exam. Steps of two thirds of the full height that nobody has
-# been trained on, straight across, the same for the three drivers.
+# Curves are homework; this is the exam. Steps of nearly three quarters of the full height that
+# nobody has been trained on, straight across, the same for the three drivers.
 
 # %%
 from fgtutor import load_specialist, make_terrain

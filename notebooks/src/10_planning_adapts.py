@@ -218,8 +218,8 @@ draw_drive(best, route, M) if best else draw_elevation(M)
 # %% [markdown]
 # ## What to try
 #
-# - `make_map("a1", seed=2, heights=(0.5, 0.4, 0.2))` lowers all steps. Which stage changes its mind
-#   first?
+# - `make_map("a1", seed=2, heights=(0.5, 0.4, 0.2))` lowers the steps of the short and the middle
+#   way. Which stage changes its mind first?
 # - Plan with the *late* tensor and walk with the *early* policy (in `drive_together`, give the
 #   route of one and name the other). What is a promise worth that somebody else has made?
 # - `AdaptationConfig(cost="inverse")` is the paper's cost, by which a diagonal step is no longer

@@ -241,7 +241,7 @@ from tqdm import tqdm
 
 every = ["steps", "bridge", "gaps", "valley"]
 kinds = every[: budget(fast=1, full=4, unit="of four kinds of ground")]
-count = budget(fast=2, full=10, unit="walks on each", each=7.0 * len(kinds))
+count = budget(fast=2, full=10, unit="walks on each", each=28.0)
 for kind in tqdm(kinds):
     table[kind] = {name: Counter() for name in contestants}
     for seed in range(101, 101 + count, 2):  # two walks on each ground
@@ -272,9 +272,10 @@ for kind, total in totals.items():
 
 # %% [markdown]
 # That is why the real table has thousands of trials behind it, and why this package never prints a
-# rate without its interval. `fgtutor evaluate matrix --robot a1 --trials 200 --out report` makes
-# one that you can put your name to; `--protocol paper` is the paper's own; it can be interrupted,
-# and it says beforehand how long it will take. Notebook 13 shows how to share the work.
+# rate without its interval. `fgtutor evaluate matrix --robot a1 --trials 200 --switch-cost 1 --out
+# report` makes one that you can put your name to; `--protocol paper` is the paper's own; it can be
+# interrupted, and it says beforehand how long it will take. Notebook 13 shows how to share the
+# work.
 
 # %% [markdown]
 # ## What to try

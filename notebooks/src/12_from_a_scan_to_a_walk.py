@@ -130,8 +130,8 @@ for where, cell in (("on the level", level), ("at an edge", edge)):
     print(f"to {scanned.p95[cell]:+.2f} m (95 %), scattered by {100 * deviation[cell]:.1f} cm")
 
 # %% [markdown]
-# And birds, dust, reflections? Throw in a hundred points that are not there. A voxel with no
-# neighbours is an outlier:
+# And birds, dust, reflections? Throw in a hundred points that are not there. A voxel far from its
+# nearest neighbours is an outlier:
 
 # %%
 dice = np.random.default_rng(0)

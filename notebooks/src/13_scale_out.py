@@ -100,10 +100,11 @@ print(f"better in {(fused > alone).float().mean():.0%} of all cells and headings
 #     fgtutor train --robot a1 --terrain slopes --from runs/a1-gentle/specialist
 #     cp -r runs/a1-slopes/specialist fgtutor/zoo/a1/slopes
 #     fgtutor doctor
+#     fgtutor evaluate calibration --robot a1
 #     fgtutor evaluate newcomer --robot a1 --newcomer slopes
 #
-# The last line measures all of this: success on its own ground and on the others', without and
-# with it, and whether the others' tensors stayed the same.
+# The last line but one is the two tests; the last one measures success on its own ground and on the
+# others', without and with it, and whether the others' tensors stayed the same.
 
 # %% [markdown]
 # ## How many trials?
@@ -208,9 +209,9 @@ draw_rates({name: (s.successes, s.trials) for name, s in by_policy.items()},
            title="However it was shared, this is what came out")  # fmt: skip
 
 # %% [markdown]
-# The same on a **Ray cluster**, of which this package needs to know nothing but the address
-# (`pip install "fgtutor[cluster]"`, then `ray start --head` on one machine, and on the others
-# `ray start --address HOST:PORT`):
+# The same on a **Ray cluster**, of which this package needs to know nothing but the address (in a
+# clone of this project `pip install -c constraints.txt -e ".[cluster]"`, then `ray start --head` on
+# one machine, and on the others `ray start --address HOST:PORT`):
 #
 #     fgtutor evaluate matrix --robot a1 --protocol paper --ray HOST:PORT --out report
 #

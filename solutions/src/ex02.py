@@ -50,7 +50,9 @@ hint("ex02.q1")
 # Why not leave out the steps after the fall? Suppose a robot runs perfectly up to a gap and falls
 # in. Averaged over the steps it survived, the label in front of the gap is 1: feasible!
 #
-# At the end of the rollout the window is shorter: take the mean of what is left.
+# At the end of the rollout the window is shorter: take the mean of what is left. (Here `r_v[t]` is
+# what step $t$ itself has earned. In notebook 03 row $t$ tells of the step before, so that labels
+# begin one row later, and where too little is left there is none.)
 
 
 # %%

@@ -23,8 +23,8 @@ from fgtutor.teach.checks import check, hint, solution
 # $$\tau = k_p (\text{target} - q) - k_d\, \dot q, \qquad k_p = 35 \text{ N m/rad}, \quad k_d = 0.5
 # \text{ N m s/rad},$$
 #
-# at most 33.5 N m either way. So an action of zero stands, and a blow is answered in the next
-# millisecond, long before the policy hears of it.
+# at most 33.5 N m either way. So an action of zero stands, and a blow is answered within five
+# milliseconds, long before the policy hears of it.
 
 
 # %%

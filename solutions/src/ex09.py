@@ -20,6 +20,7 @@ from fgtutor.teach.checks import check, hint, solution
 # Nobody learns on a cliff. The training world has rows of growing difficulty, 0 to `last`. After an
 # episode, a robot moves one row **up** if its mean $r_v$ was above 0.5 and it did not fall, one row
 # **down** if its mean $r_v$ was below 0.3 or it fell, and else it stays. Nobody leaves the world.
+# (The thresholds are the toy's, and the rule a little simpler than the one of notebook 09.)
 
 
 # %%

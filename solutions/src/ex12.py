@@ -42,7 +42,7 @@ hint("ex12.q1")
 # %% [markdown]
 # ## ex12.q2
 #
-# The robot believes to be where it is not. Each position fix has an error of standard deviation
+# The robot is mistaken about where it is. Each position fix has an error of standard deviation
 # `fix` (m), new every time; and an error that drifts as a random walk, `drift` metres per square
 # root of a second. After four seconds a random walk has got twice as far as after one, not four
 # times: its steps partly undo each other.
