@@ -3,7 +3,7 @@
 #
 # - **You will be able to** read a training curve, stop a training and go on with it, say how a
 #   curriculum, an advantage and an adaptive learning rate work, and judge what has come out
-# - **Time** half an hour to read; about 7 minutes on two CPU cores, most of it one training
+# - **Time** half an hour to read; about 4 minutes on two CPU cores, most of it two trainings
 # - **Needs** notebooks [02](02_a_robot_that_falls.ipynb) and [03](03_feasibility_net.ipynb) for
 #   PPO and labels, and [08](08_meet_the_a1.ipynb); uses the shipped specialists
 # - **If a part is slow** run `%env FGTUTOR_FAST=1` in a new cell at the top: then it trains for
@@ -53,7 +53,7 @@ from fgtutor.teach.notebooks import budget
 
 walker = ZOO / "a1" / "_walker"
 robots = budget(fast=48, full=256, unit="robots")
-iterations = budget(fast=4, full=60, unit="iterations of 40 steps", each=5.0)
+iterations = budget(fast=4, full=60, unit="iterations of 40 steps", each=2.0)
 config = A1TrainConfig(
     terrain="steps", rows=5, columns=2, num_envs=robots, iterations=iterations,
     start_from=walker, critic_warmup=2, save_every=20,
@@ -180,7 +180,7 @@ again.draw(mine.provenance["curve"])
 # %%
 from fgtutor.training import Trainer
 
-crank = budget(fast=4, full=25, unit="iterations", each=5.0)
+crank = budget(fast=4, full=25, unit="iterations", each=2.0)
 scratch = Trainer(replace(config, start_from=None, out=Path("runs") / "09-from-nothing"))
 
 # %%

@@ -161,7 +161,7 @@ from fgtutor.execution import FollowConfig
 from fgtutor.teach.a1_lessons import drive_together
 from fgtutor.teach.notebooks import budget
 
-trials = budget(fast=2, full=12, unit="walks for each stage", each=10.0)
+trials = budget(fast=2, full=12, unit="walks for each stage", each=1.5)
 jobs = [(route, terrain, seed) for route in routes.values() for seed in range(trials)]
 walks = drive_together(jobs, stages, config=FollowConfig(patience=1.15, grace=4.0))
 walked = {name: walks[i * trials : (i + 1) * trials] for i, name in enumerate(routes)}

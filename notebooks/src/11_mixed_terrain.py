@@ -3,7 +3,7 @@
 #
 # - **You will be able to** send four specialists over a course that none of them masters alone,
 #   read from the plan who goes where and why, and put an honest table beside a film
-# - **Time** half an hour to read; about a minute on two CPU cores, five in full
+# - **Time** half an hour to read; about 3 minutes on two CPU cores
 # - **Needs** notebooks [06](06_fuse_and_plan.ipynb), [07](07_drive_the_plan.ipynb) and
 #   [08](08_meet_the_a1.ipynb); uses the shipped specialists and the generalist
 # - **If a part is slow** run `%env FGTUTOR_FAST=1` in a new cell at the top: one ground a cell of

@@ -3,7 +3,7 @@
 #
 # - **You will be able to** turn a LiDAR's points into an elevation map and say what it rests on,
 #   foresee how lost a robot gets, and plan so that being a little lost does no harm
-# - **Time** half an hour to read; about a minute on two CPU cores, three in full
+# - **Time** half an hour to read; about a minute on two CPU cores
 # - **Needs** notebooks [07](07_drive_the_plan.ipynb) and [11](11_mixed_terrain.ipynb); uses the
 #   shipped specialists
 # - **If a part is slow** run `%env FGTUTOR_FAST=1` in a new cell at the top: fewer walks, and a
