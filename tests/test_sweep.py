@@ -314,8 +314,13 @@ def test_interrupted_and_gone_on_is_the_same(whole, config, monkeypatch):
     cost = TrainingCost(trainings=2, samples=384, seconds=1.0)
     monkeypatch.setattr(sweep, "estimate", lambda works: cost)
     monkeypatch.setattr(training.Trainer, "iterate", asked_to_stop)
-    with pytest.raises(KeyboardInterrupt):
-        sweep.run(config)
+    # A process that a shell has put into the background ignores Ctrl-C, and these tests may be one.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            sweep.run(config)
+    finally:
+        signal.signal(signal.SIGINT, before)
     monkeypatch.undo()
     assert (config.folder / "runs/steps-1/snapshots/4").exists()
     assert not list((config.folder / "shards").iterdir())  # half a training is no result

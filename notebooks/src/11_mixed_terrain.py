@@ -241,7 +241,7 @@ from tqdm import tqdm
 
 every = ["steps", "bridge", "gaps", "valley"]
 kinds = every[: budget(fast=1, full=4, unit="of four kinds of ground")]
-count = budget(fast=2, full=10, unit="walks on each", each=28.0)
+count = budget(fast=2, full=10, unit="walks on each", each=7.0)
 for kind in tqdm(kinds):
     table[kind] = {name: Counter() for name in contestants}
     for seed in range(101, 101 + count, 2):  # two walks on each ground
