@@ -3,7 +3,7 @@
 #
 # - **You will be able to** drive a planned route in simulation, switch policies on the way, hold
 #   the plan's promises against the deed, and report a success rate that you may believe
-# - **Time** half an hour to read; about 5 minutes on two CPU cores, most of it one table
+# - **Time** half an hour to read; about 2 minutes on two CPU cores, most of it one table
 # - **Needs** notebook [06](06_fuse_and_plan.ipynb) for routes; uses the shipped specialists
 # - **If a part is slow** run `%env FGTUTOR_FAST=1` in a new cell at the top: fewer trials in the
 #   table at the end, the only long cell. It shows a bar and can be stopped
@@ -184,7 +184,7 @@ everyone = load_zoo("toy", include_general=True)
 contestants = [*zoo, "ours", "general", "occupancy+P"]
 chosen = {name: planners(everyone)[name] for name in contestants}
 kinds = ["steps", "gaps", "slopes", "rubble", "mixed"]
-trials = budget(fast=2, full=20, unit="trials a cell, 35 cells", each=14.0)
+trials = budget(fast=2, full=20, unit="trials a cell, 35 cells", each=3.0)
 
 # %%
 from tqdm import tqdm

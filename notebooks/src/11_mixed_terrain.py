@@ -3,7 +3,7 @@
 #
 # - **You will be able to** send four specialists over a course that none of them masters alone,
 #   read from the plan who goes where and why, and put an honest table beside a film
-# - **Time** half an hour to read; about 3 minutes on two CPU cores
+# - **Time** half an hour to read; about a minute on two CPU cores
 # - **Needs** notebooks [06](06_fuse_and_plan.ipynb), [07](07_drive_the_plan.ipynb) and
 #   [08](08_meet_the_a1.ipynb); uses the shipped specialists and the generalist
 # - **If a part is slow** run `%env FGTUTOR_FAST=1` in a new cell at the top: one ground a cell of
@@ -40,7 +40,7 @@ from fgtutor.errors import PlanningError
 from fgtutor.teach.a1_lessons import daring_route
 from fgtutor.teach.notebooks import budget
 
-for seed in range(1, 2 * budget(fast=2, full=8, unit="courses at most", each=6.0), 2):
+for seed in range(1, 2 * budget(fast=2, full=8, unit="courses at most", each=2.0), 2):
     terrain = corridor("mixed", seed)
     view = View(terrain.elevation, everyone, "calibrated")
     try:
@@ -163,7 +163,7 @@ show_walk(episode, terrain, route, count=9)
 from fgtutor.errors import RenderingError
 from fgtutor.teach.videos import save_video
 
-fps = budget(fast=1, full=12, unit="frames for each second of the walk", each=6.0)
+fps = budget(fast=1, full=12, unit="frames for each second of the walk", each=2.0)
 try:
     print("a film:", save_video(episode, terrain, route, "walk.mp4", fps=fps))
 except RenderingError:
@@ -214,7 +214,7 @@ def compete(ground, view, seeds):
 
 
 # %%
-trials = budget(fast=2, full=10, unit="walks for each of them", each=8.0)
+trials = budget(fast=2, full=10, unit="walks for each of them", each=1.5)
 table = {"mixed": compete(terrain, view, range(trials))}
 for name in contestants:
     print(f"{name:8}", dict(+table["mixed"][name]))
@@ -241,7 +241,7 @@ from tqdm import tqdm
 
 every = ["steps", "bridge", "gaps", "valley"]
 kinds = every[: budget(fast=1, full=4, unit="of four kinds of ground")]
-count = budget(fast=2, full=10, unit="walks on each", each=7.0)
+count = budget(fast=2, full=10, unit="walks on each", each=1.5)
 for kind in tqdm(kinds):
     table[kind] = {name: Counter() for name in contestants}
     for seed in range(101, 101 + count, 2):  # two walks on each ground
