@@ -56,14 +56,10 @@ def table(trials: Sequence[Row]) -> str:
     return markdown(
         ["terrain", *columns],
         (
-            [terrain, *(Share.of(_reached(cells[terrain, policy])) for policy in columns)]
+            [terrain, *(Share.reached(cells[terrain, policy]) for policy in columns)]
             for terrain in dict.fromkeys(terrain for terrain, _ in cells)
         ),
     )
-
-
-def _reached(trials: Sequence[Row]) -> list[bool]:
-    return [trial["outcome"] == "reached" for trial in trials]
 
 
 def run(config: MatrixConfig) -> int:

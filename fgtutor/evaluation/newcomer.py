@@ -6,7 +6,6 @@ On every ground the tensors of the others are compared, bit for bit.
 Source: paper, Sec. III-C: F_max is a maximum over specialists, so one more only adds to it.
 """
 
-import hashlib
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -17,6 +16,7 @@ from tempfile import TemporaryDirectory
 from fgtutor.baselines import Layers, View, ours
 from fgtutor.errors import ConfigError, EvaluationError
 from fgtutor.evaluation import success
+from fgtutor.evaluation.provenance import digest
 from fgtutor.evaluation.report import Share, markdown
 from fgtutor.evaluation.runner import Row
 from fgtutor.evaluation.success import TrialsConfig, by_cell, make_ground, summarise
@@ -130,10 +130,7 @@ def _ours_noted(digests: list[dict[str, str]], view: View) -> Sequence[Layers]:
     """Plan as ours does, and note a digest of each tensor that is planned on."""
     (layers,) = ours(view)
     digests.append(
-        {
-            name: hashlib.sha256(tensor.contiguous().numpy().tobytes()).hexdigest()[:16]
-            for name, tensor in layers.items()
-        }
+        {name: digest(tensor.contiguous().numpy().tobytes()) for name, tensor in layers.items()}
     )
     return [layers]
 

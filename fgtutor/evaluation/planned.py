@@ -4,11 +4,11 @@ Reads nothing; gives `PlannedConfig`, from which the commands' own configuration
 Source: paper, Sec. III-B (taus) and III-C (edge cost, f_min).
 """
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from fgtutor.evaluation.provenance import digest
 from fgtutor.evaluation.shards import RunConfig
 from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo
 
@@ -47,7 +47,4 @@ class PlannedConfig(RunConfig):
 
     def zoo_digests(self) -> dict[str, str]:
         """Return a digest of each of them, which changes with any of its weights."""
-        return {
-            folder.name: hashlib.sha256((folder / DESCRIPTION).read_bytes()).hexdigest()[:16]
-            for folder in self.folders
-        }
+        return {folder.name: digest((folder / DESCRIPTION).read_bytes()) for folder in self.folders}

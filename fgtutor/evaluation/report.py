@@ -47,6 +47,11 @@ class Share:
         outcomes = [bool(success) for success in successes]
         return cls(successes=sum(outcomes), trials=len(outcomes))
 
+    @classmethod
+    def reached(cls, trials: Iterable[Row]) -> Self:
+        """Count the trials that reached their goal."""
+        return cls.of(trial["outcome"] == "reached" for trial in trials)
+
     @property
     def interval(self) -> tuple[float, float]:
         """The ends of the interval, in [0, 1]."""

@@ -171,11 +171,13 @@ def summarise(trials: Sequence[Row]) -> Row:
     }
 
 
-def by_cell(trials: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
-    """Sort trials by terrain and policy, in the order in which they first appear."""
-    cells: dict[tuple[str, str], list[Row]] = {}
+def by_cell(
+    trials: Sequence[Row], keys: Sequence[str] = ("terrain", "policy")
+) -> dict[tuple[Any, ...], list[Row]]:
+    """Sort trials by the values of `keys`, in the order in which these first appear."""
+    cells: dict[tuple[Any, ...], list[Row]] = {}
     for trial in trials:
-        cells.setdefault((trial["terrain"], trial["policy"]), []).append(trial)
+        cells.setdefault(tuple(trial[key] for key in keys), []).append(trial)
     return cells
 
 

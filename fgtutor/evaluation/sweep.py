@@ -7,7 +7,6 @@ a worker that is killed in it costs the time since the last checkpoint, and not 
 """
 
 import contextlib
-import hashlib
 import io
 import math
 import os
@@ -16,6 +15,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -32,12 +32,13 @@ from fgtutor.evaluation.calibration import CalibrationConfig
 from fgtutor.evaluation.chart import share_chart
 from fgtutor.evaluation.cost import on_cores
 from fgtutor.evaluation.metrics import calibration as compare
+from fgtutor.evaluation.provenance import digest
 from fgtutor.evaluation.report import Findings, Share, markdown
 from fgtutor.evaluation.runner import Row, Task
 from fgtutor.evaluation.shards import RunConfig, part_of, settings_of
-from fgtutor.evaluation.success import TrialsConfig, cut, make_ground
+from fgtutor.evaluation.success import TrialsConfig, by_cell, cut, make_ground
 from fgtutor.evaluation.trials import drive
-from fgtutor.recipe import A1TrainConfig, TrainConfig, comparable
+from fgtutor.recipe import A1TrainConfig, TrainConfig, comparable, training_world
 from fgtutor.recipe import config_of as recipe_of
 from fgtutor.robots import env_class
 from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist
@@ -89,12 +90,11 @@ class SweepConfig(RunConfig):
             raise ConfigError("trainings keep their checkpoints in a folder: give --out FOLDER")
         if self.trials < 1 or not self.seeds:
             raise ConfigError(f"need trials >= 1 and a seed, got {self.trials} and {self.seeds}")
-        untouched = replace(type(self.train)(), robot=self.train.robot)
+        untouched = type(self.train)()
         for name in OURS_TO_SET:
-            if getattr(self.train, name) != getattr(untouched, name):
+            given = getattr(self.train, name)
+            if given != getattr(untouched, name) and (name, given) != ("robot", self.robot):
                 raise _set_elsewhere(name)
-        if self.train.robot not in (self.robot, type(self.train)().robot):
-            raise _set_elsewhere("robot")
         if len(self.vary) == 1:
             raise ConfigError(f"nothing to vary {self.vary[0]} by: give its values too")
         name = self.vary[0].replace("-", "_") if self.vary else ""
@@ -151,34 +151,22 @@ def trainings(config: SweepConfig) -> list[Training]:
     Raises `ConfigError` if a value does not fit, or two trainings would be the same.
     """
     env_class(config.robot)  # an unknown robot fails here
+    terrains, start = config.terrains or SCALES[config.robot].mixed, config.train.start_from
+    shared = replace(config.train, robot=config.robot, start_from=start and start.resolve())
+    for terrain in terrains:  # as does an unknown terrain
+        training_world(replace(shared, terrain=terrain, rows=1, columns=1))
     option, *values = config.vary or ("", "")
-    everyone = [
-        _training(config, terrain, option, value, seed)
-        for terrain in config.terrains or SCALES[config.robot].mixed
-        for value in values
-        for seed in config.seeds
-    ]
-    names = [training.name for training in everyone]
+    varied = {value: _with(shared, option, value) if option else shared for value in values}
+    everyone = []
+    for terrain, value, seed in product(terrains, values, config.seeds):
+        setting = f"{option}-{re.sub(r'[^A-Za-z0-9.+-]', '_', value)}" if option else ""
+        name = "-".join(filter(None, (terrain, setting, str(seed))))
+        own = replace(varied[value], terrain=terrain, seed=seed, out=config.folder / RUNS / name)
+        everyone.append(Training(name=name, setting=value, config=own))
+    names = [each.name for each in everyone]
     if twice := {name for name in names if names.count(name) > 1}:
         raise ConfigError(f"asked twice for {', '.join(sorted(twice))}: give each value once")
-    for each in everyone:  # as does an unknown terrain
-        training.training_world(replace(each.config, rows=1, columns=1))
     return everyone
-
-
-def _training(config: SweepConfig, terrain: str, option: str, value: str, seed: int) -> Training:
-    setting = f"{option}-{re.sub(r'[^A-Za-z0-9.+-]', '_', value)}" if option else ""
-    name = "-".join(filter(None, (terrain, setting, str(seed))))
-    start = config.train.start_from
-    own = replace(
-        config.train,
-        robot=config.robot,
-        terrain=terrain,
-        seed=seed,
-        out=config.folder / RUNS / name,
-        start_from=start and start.resolve(),
-    )
-    return Training(name=name, setting=value, config=_with(own, option, value) if option else own)
 
 
 def _with(config: TrainConfig, option: str, value: str) -> TrainConfig:
@@ -294,22 +282,16 @@ def estimate(works: Sequence[Training]) -> TrainingCost:
 
 def _groups(rows: Sequence[Row]) -> Iterator[tuple[tuple[str, str], dict[int, list[Row]]]]:
     """Give for every terrain and value the crossings by seed, in the order of the trainings."""
-    groups: dict[tuple[str, str], dict[int, list[Row]]] = {}
-    for row in rows:
-        seeds = groups.setdefault((row["trained_on"], row["setting"]), {})
-        seeds.setdefault(row["training_seed"], []).append(row)
-    yield from groups.items()
-
-
-def _share(rows: Sequence[Row]) -> Share:
-    return Share.of(row["outcome"] == "reached" for row in rows)
+    for group, crossings in by_cell(rows, ("trained_on", "setting")).items():
+        seeds = by_cell(crossings, ("training_seed",))
+        yield group, {seed: same for (seed,), same in seeds.items()}
 
 
 def table(rows: Sequence[Row], option: str = "") -> str:
     """Return the crossings as a Markdown table: a line a terrain and value, a column a seed."""
     lines, seeds = [], list(dict.fromkeys(row["training_seed"] for row in rows))
     for (terrain, setting), by_seed in _groups(rows):
-        shares = [_share(by_seed[seed]) for seed in seeds]
+        shares = [Share.reached(by_seed[seed]) for seed in seeds]
         firsts = [by_seed[seed][0] for seed in seeds]
         lines.append(
             [
@@ -339,7 +321,7 @@ def run(config: SweepConfig) -> int:
     def find(rows: list[Row]) -> Findings:
         groups = {
             " ".join(filter(None, (terrain, option, setting))): {
-                f"seed {seed}": _share(crossings) for seed, crossings in by_seed.items()
+                f"seed {seed}": Share.reached(crossings) for seed, crossings in by_seed.items()
             }
             for (terrain, setting), by_seed in _groups(rows)
         }
@@ -418,4 +400,4 @@ def _digest(start: Path) -> str:
     files = [start / name for name in (CHECKPOINT, DESCRIPTION) if (start / name).is_file()]
     if not files:
         raise SpecialistError(f"{start} holds no specialist to start from: give another folder")
-    return hashlib.sha256(files[0].read_bytes()).hexdigest()[:16]
+    return digest(files[0].read_bytes())

@@ -303,7 +303,7 @@ def table(trials: Sequence[Row]) -> str:
                 [
                     f"{100 * noise:g} + {100 * drift:g}",
                     planner,
-                    *(_share(cells[name]) for name in names),
+                    *(Share.reached(cells[name]) for name in names),
                     *(failed[reason] for reason in ("no_route", "fell", "timeout")),
                     f"{fmean(switches):.1f}" if switches else "-",
                 ]
@@ -312,16 +312,12 @@ def table(trials: Sequence[Row]) -> str:
     return markdown(columns, lines)
 
 
-def _share(trials: Sequence[Row]) -> Share:
-    return Share.of(trial["outcome"] == "reached" for trial in trials)
-
-
 def charts(trials: Sequence[Row]) -> dict[str, Draw]:
     """Return a chart a level: planners within courses."""
     figures: dict[str, Draw] = {}
     for (noise, drift), planners in by_level(trials).items():
         groups = {
-            course: {planner: _share(cells[course]) for planner, cells in planners.items()}
+            course: {planner: Share.reached(cells[course]) for planner, cells in planners.items()}
             for course in dict.fromkeys(trial["course"] for trial in trials)
         }
         title = f"Fixes off by {100 * noise:g} cm, drift {100 * drift:g} cm per root second"
