@@ -1,0 +1,138 @@
+"""Checking values that come from outside: settings of a command, and records read from files.
+
+Reads dataclasses whose fields say by their type what they may hold, such as `Annotated[int,
+Ge(1)]`; gives the values back, or an error that names the field, its range and what came. A float
+must be finite unless its field says otherwise (`Unbounded`). The types are annotated-types'.
+"""
+
+import re
+import types
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from annotated_types import Ge, Gt, Interval
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from fgtutor.errors import ConfigError, FgtutorError
+
+T = TypeVar("T")
+
+Count = Annotated[int, Interval(ge=1, le=10**9)]
+"""A number of things, at least one."""
+CountOrZero = Annotated[int, Interval(ge=0, le=10**9)]
+"""A number of things, or 0, of which the field says what it means."""
+Seed = Annotated[int, Interval(ge=0, le=2**32 - 1)]
+"""What random numbers follow from; numpy, torch and Python all take these."""
+Share = Annotated[float, Interval(ge=0, le=1)]
+"""A part of a whole, from 0 to 1."""
+Positive = Annotated[float, Gt(0)]
+"""A finite number above 0."""
+NonNegative = Annotated[float, Ge(0)]
+"""A finite number from 0."""
+Unbounded = Annotated[float, Gt(0), Field(allow_inf_nan=True)]
+"""A number above 0, or infinity for no limit."""
+LARGEST_RECORD = 20_000_000
+"""Bytes of the largest record that is read; a specialist's description has forty thousand."""
+
+_FINITE = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+def check_fields(config: Any, error: type[FgtutorError] = ConfigError) -> None:
+    """Raise `error` unless every number and choice of a dataclass is what its type allows.
+
+    A dataclass calls this in `__post_init__`, so that its values are checked whoever builds it.
+    """
+    for name, adapter in _numeric_fields(type(config)).items():
+        value = getattr(config, name)
+        try:
+            adapter.validate_python(_plain(value))
+        except ValidationError as problem:
+            raise error(f"{name}: {_first(problem)}") from None
+
+
+def parse_record(
+    kind: type[T], data: bytes | str | Mapping[str, Any], error: type[FgtutorError], source: str
+) -> T:
+    """Return `data`, JSON or what JSON gave, as a `kind` (a dataclass or a type such as list[int]).
+
+    A missing or unknown key, a number of another type or out of range and a text where a number is
+    expected are refused, here and in every dataclass within. Raises `error`, which names `source`.
+    """
+    try:
+        if isinstance(data, bytes | str):
+            if len(data) > LARGEST_RECORD:
+                raise error(f"{source} has {len(data)} bytes, more than {LARGEST_RECORD}")
+            return _record(kind).validate_json(data)
+        return _record(kind).validate_python(data, strict=False)
+    except ValidationError as problem:
+        raise error(f"{source}: {_first(problem)}") from None
+
+
+def read_record(kind: type[T], path: str | Path, error: type[FgtutorError]) -> T:
+    """Return what a JSON file holds, as `parse_record`; raises `error` if it cannot be read too."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(LARGEST_RECORD + 1)
+    except OSError as problem:
+        raise error(f"cannot read {path}: {problem.strerror or problem}") from problem
+    return parse_record(kind, data, error, str(path))
+
+
+@cache
+def _numeric_fields(kind: type) -> dict[str, TypeAdapter]:
+    """Return a checker for each field of a dataclass that holds numbers or one of some words."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {
+        field.name: TypeAdapter(hints[field.name], config=_FINITE)
+        for field in fields(kind)
+        if _is_plain(hints[field.name])
+    }
+
+
+def _is_plain(hint: Any) -> bool:
+    """Tell whether a type is made of numbers, choices, None and tuples of them alone."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _is_plain(inner[0])
+    if origin is Literal:
+        return True
+    if origin in (Union, types.UnionType, tuple):
+        return all(_is_plain(part) for part in inner if part not in (Ellipsis, types.NoneType))
+    return hint in (int, float)
+
+
+def _plain(value: Any) -> Any:
+    """Return numpy's numbers as Python's, and a list as the tuple that a field holds."""
+    if isinstance(value, np.generic):
+        return value.item()
+    return tuple(_plain(part) for part in value) if isinstance(value, tuple | list) else value
+
+
+@cache
+def _record(kind: Any) -> TypeAdapter:
+    """Return the reader of a type, which refuses unknown keys in every dataclass."""
+    if not (isinstance(kind, type) and is_dataclass(kind)):
+        return TypeAdapter(kind, config=_FINITE)
+    if "__pydantic_config__" not in kind.__dict__:
+        kind.__pydantic_config__ = ConfigDict(**_FINITE, extra="forbid")  # type: ignore
+        for hint in get_type_hints(kind).values():
+            for part in (hint, *get_args(hint)):
+                if is_dataclass(part):
+                    _record(part)
+    return TypeAdapter[Any](kind)
+
+
+def _first(problem: ValidationError) -> str:
+    """Return what is wrong first, and where, in one line."""
+    one = problem.errors(include_url=False, include_context=False)[0]
+    where = ".".join(str(part) for part in one["loc"])
+    came = re.sub(r"\s+", " ", repr(one["input"]))
+    came = came if len(came) <= 60 else f"{came[:57]}..."
+    what = one["msg"].replace("Input should", "should").removeprefix("Value error, ")
+    text = f"{what[:1].lower()}{what[1:]}, got {came}"
+    return f"{where}: {text}" if where else text

@@ -1,0 +1,108 @@
+"""Settings and records from outside: what fits comes back, what does not is named."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from fgtutor.errors import ConfigError, MapError
+from fgtutor.validation import (
+    Count,
+    Positive,
+    Seed,
+    Unbounded,
+    check_fields,
+    parse_record,
+    read_record,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    speed: Positive = 1.0
+    robots: Count = 3
+    hidden: tuple[Count, ...] = (1, 2)
+    kind: Literal["a", "b"] = "a"
+    seed: Seed | None = None
+    patience: Unbounded = float("inf")
+    note: Any = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+@dataclass(frozen=True)
+class Record:
+    settings: Settings
+    more: list[Settings]
+    command: tuple[float, float, float]
+    extra: dict[str, Any]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("speed", float("nan"), "finite"),
+        ("speed", float("inf"), "finite"),
+        ("speed", -1, "greater than 0, got -1"),
+        ("speed", "1", "valid number"),
+        ("robots", 0, "greater than or equal to 1"),
+        ("robots", 1.5, "integer"),
+        ("robots", True, "integer"),
+        ("robots", 10**400, "less than"),
+        ("hidden", (4, 0), "hidden: 1: "),
+        ("kind", "c", "'a' or 'b'"),
+        ("seed", -1, "greater than or equal to 0"),
+        ("patience", float("nan"), "greater than 0"),
+    ],
+)
+def test_a_setting_that_cannot_work_is_named(field, value, says):
+    with pytest.raises(ConfigError, match=f"^{field}: ") as caught:
+        Settings(**{field: value})
+    assert says in str(caught.value)
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert Settings(speed=np.float32(2), robots=np.int64(3), hidden=[4, 5]).robots == 3
+
+
+GOOD = '{"settings": {"robots": 2}, "more": [{}], "command": [1, 2, 3.5], "extra": {"a": [1]}}'
+
+
+def test_a_record_comes_back_as_its_dataclass(tmp_path):
+    (tmp_path / "r.json").write_text(GOOD)
+    record = read_record(Record, tmp_path / "r.json", MapError)
+    assert record.settings.robots == 2 and record.command == (1.0, 2.0, 3.5)
+    assert record.more == [Settings()] and record.extra == {"a": [1]}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('"robots": 2', '"robot": 2', "settings.robot: unexpected"),
+        ("[{}]", '[{"x": 1}]', "more.0.x: unexpected"),
+        ("3.5", "NaN", "command.2: should be a finite number"),
+        ("3.5", "1e999", "command.2: should be a finite number"),
+        ("3.5", '"3.5"', "command.2: "),
+        ('"robots": 2', '"robots": 0', "settings.robots: "),
+        ('"robots": 2', f'"robots": 1{"0" * 400}', "settings.robots: "),
+        (', "extra": {"a": [1]}', "", "extra: field required"),
+        ('{"a": [1]}', "[" * 5000, "invalid JSON"),
+        (GOOD, "", "invalid JSON"),
+        (GOOD, "\udcff".encode("utf-8", "surrogateescape").decode("latin-1"), "invalid JSON"),
+    ],
+)
+def test_a_record_that_does_not_fit_is_refused_with_the_place(old, new, says):
+    with pytest.raises(MapError, match=r"^r\.json: ") as caught:
+        parse_record(Record, GOOD.replace(old, new), MapError, "r.json")
+    assert says in str(caught.value)
+
+
+def test_a_file_that_is_missing_or_too_large_is_refused(tmp_path, monkeypatch):
+    with pytest.raises(MapError, match="cannot read"):
+        read_record(Record, tmp_path / "none.json", MapError)
+    monkeypatch.setattr("fgtutor.validation.LARGEST_RECORD", 10)
+    (tmp_path / "r.json").write_text(GOOD)
+    with pytest.raises(MapError, match="more than 10"):
+        read_record(Record, tmp_path / "r.json", MapError)
