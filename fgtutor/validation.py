@@ -5,21 +5,41 @@ Ge(1)]`; gives the values back, or an error that names the field, its range and 
 must be finite unless its field says otherwise (`Unbounded`). The types are annotated-types'.
 """
 
+import inspect
+import json
 import re
 import types
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, make_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from annotated_types import Ge, Gt, Interval
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from fgtutor.errors import ConfigError, FgtutorError
 
 T = TypeVar("T")
+
+NAME = re.compile(r"\w(?:[\w .+-]{0,98}[\w+-])?")
+"""What a name may be; it then reads alike in a path, a table, a picture and on a terminal."""
+
+
+def _named(text: str) -> str:
+    if not NAME.fullmatch(text):
+        raise ValueError(
+            "a name has up to 100 letters, digits, spaces and _ . + -, a letter or digit at each end"
+        )
+    return text
+
+
+def _once(values: tuple) -> tuple:
+    if twice := [value for i, value in enumerate(values) if value in values[:i]]:
+        raise ValueError(f"give each only once, {twice[0]!r} is there twice")
+    return values
+
 
 Count = Annotated[int, Interval(ge=1, le=10**9)]
 """A number of things, at least one."""
@@ -35,6 +55,12 @@ NonNegative = Annotated[float, Ge(0)]
 """A finite number from 0."""
 Unbounded = Annotated[float, Gt(0), Field(allow_inf_nan=True)]
 """A number above 0, or infinity for no limit."""
+Width = Annotated[int, Interval(ge=1, le=100_000)]
+"""How many numbers a vector has, or a layer of a network."""
+Name = Annotated[str, AfterValidator(_named)]
+"""What something is called; see `NAME`."""
+Unique = AfterValidator(_once)
+"""No value of a tuple comes twice: `Annotated[tuple[str, ...], Unique]`."""
 LARGEST_RECORD = 20_000_000
 """Bytes of the largest record that is read; a specialist's description has forty thousand."""
 
@@ -62,12 +88,15 @@ def parse_record(
     A missing or unknown key, a number of another type or out of range and a text where a number is
     expected are refused, here and in every dataclass within. Raises `error`, which names `source`.
     """
+    # Of Python's values pydantic reads a dataclass only if it may also take "1" for 1.
     try:
-        if isinstance(data, bytes | str):
-            if len(data) > LARGEST_RECORD:
-                raise error(f"{source} has {len(data)} bytes, more than {LARGEST_RECORD}")
-            return _record(kind).validate_json(data)
-        return _record(kind).validate_python(data, strict=False)
+        text = data if isinstance(data, bytes | str) else json.dumps(data)
+    except (TypeError, ValueError, RecursionError) as problem:
+        raise error(f"{source} is not JSON: {problem}") from None
+    if len(text) > LARGEST_RECORD:
+        raise error(f"{source} has {len(text)} bytes, more than {LARGEST_RECORD}")
+    try:
+        return _record(kind).validate_json(text)
     except ValidationError as problem:
         raise error(f"{source}: {_first(problem)}") from None
 
@@ -84,6 +113,21 @@ def read_record(kind: type[T], path: str | Path, error: type[FgtutorError]) -> T
 
 
 @cache
+def arguments(kind: type, base: type = object) -> type:
+    """Return a record of what a class takes beyond `base`: its arguments that are numbers.
+
+    So a file can say how to build it, and nothing else; `Literal` words count as numbers here.
+    """
+    known = inspect.signature(base).parameters
+    hints = {}
+    for part in kind.__mro__:
+        if part is not base and issubclass(part, base) and "__init__" in part.__dict__:
+            own = get_type_hints(part.__init__, include_extras=True)
+            hints = {k: v for k, v in own.items() if k not in known and _is_plain(v)} | hints
+    return make_dataclass(kind.__name__, hints.items(), frozen=True, kw_only=True)
+
+
+@cache
 def _numeric_fields(kind: type) -> dict[str, TypeAdapter]:
     """Return a checker for each field of a dataclass that holds numbers or one of some words."""
     hints = get_type_hints(kind, include_extras=True)
@@ -95,15 +139,15 @@ def _numeric_fields(kind: type) -> dict[str, TypeAdapter]:
 
 
 def _is_plain(hint: Any) -> bool:
-    """Tell whether a type is made of numbers, choices, None and tuples of them alone."""
+    """Tell whether a type is made of numbers, choices, None and their tuples, or checked words."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return _is_plain(inner[0])
+        return _is_plain(inner[0]) or inner[0] in (str, tuple[str, ...], tuple[Name, ...])
     if origin is Literal:
         return True
     if origin in (Union, types.UnionType, tuple):
         return all(_is_plain(part) for part in inner if part not in (Ellipsis, types.NoneType))
-    return hint in (int, float)
+    return hint in (int, float, bool)
 
 
 def _plain(value: Any) -> Any:

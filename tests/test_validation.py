@@ -1,7 +1,7 @@
 """Settings and records from outside: what fits comes back, what does not is named."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
@@ -9,9 +9,13 @@ import pytest
 from fgtutor.errors import ConfigError, MapError
 from fgtutor.validation import (
     Count,
+    Name,
     Positive,
     Seed,
     Unbounded,
+    Unique,
+    Width,
+    arguments,
     check_fields,
     parse_record,
     read_record,
@@ -27,6 +31,10 @@ class Settings:
     seed: Seed | None = None
     patience: Unbounded = float("inf")
     note: Any = None
+    name: Name = "steps"
+    terrains: Annotated[tuple[str, ...], Unique] = ()
+    levels: Annotated[tuple[tuple[float, float], ...], Unique] = ()
+    cold: bool = False
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -55,12 +63,57 @@ class Record:
         ("kind", "c", "'a' or 'b'"),
         ("seed", -1, "greater than or equal to 0"),
         ("patience", float("nan"), "greater than 0"),
+        ("name", "a|b", "letters, digits"),
+        ("name", "\x1b[31m", "got '\\x1b[31m'"),
+        ("name", "\u202etxt", "letters, digits"),
+        ("name", "M\udcff", "name: "),
+        ("name", "../steps", "letters, digits"),
+        ("name", "..", "letters, digits"),
+        ("name", "a ", "at each end"),
+        ("name", "", "letters, digits"),
+        ("name", "a" * 101, "letters, digits"),
+        ("terrains", ("a", "b", "a"), "only once, 'a' is there twice"),
+        ("levels", ((0.0, 1), (0, 1.0)), "only once"),
+        ("cold", 1, "valid boolean"),
     ],
 )
 def test_a_setting_that_cannot_work_is_named(field, value, says):
     with pytest.raises(ConfigError, match=f"^{field}: ") as caught:
         Settings(**{field: value})
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["steps", "Brücke 2", "a1-steps_v1.2+x", "_walker", "階段"])
+def test_a_name_is_a_word_in_any_language(name):
+    assert Settings(name=name).name == name
+
+
+class Base:
+    def __init__(self, size: int, *, seed: int = 0) -> None: ...
+
+
+class Middle(Base):
+    def __init__(self, *args: Any, wide: Width, cls: Any = None, **more: Any) -> None: ...
+
+
+class Last(Middle):
+    def __init__(self, *args: Any, scale: Positive, kind: Literal["a"], **more: Any) -> None: ...
+
+
+def test_what_a_class_takes_is_read_as_its_signature_says():
+    data = {"wide": 3, "scale": 2, "kind": "a"}
+    built = parse_record(arguments(Last, Base), data, MapError, "m")
+    assert vars(built) == {"wide": 3, "scale": 2.0, "kind": "a"}
+    for wrong in ({"wide": 0}, {"scale": "2"}, {"kind": "b"}, {"cls": None}, {"seed": 1}):
+        with pytest.raises(MapError, match=f"m: {next(iter(wrong))}: "):
+            parse_record(arguments(Last, Base), data | wrong, MapError, "m")
+
+
+def test_values_are_read_as_strictly_as_json():
+    for data in (["1"], [True], [1.0], [float("nan")], [object()], [10**5000]):
+        with pytest.raises(MapError, match="m"):
+            parse_record(list[int], {"a": data}["a"], MapError, "m")  # type: ignore
+    assert parse_record(list[float], [1, 2.5], MapError, "m") == [1.0, 2.5]  # type: ignore
 
 
 def test_numbers_of_numpy_are_numbers():
