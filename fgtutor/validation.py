@@ -9,9 +9,10 @@ import inspect
 import json
 import re
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, make_dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -30,9 +31,15 @@ NAME = re.compile(r"\w(?:[\w .+-]{0,98}[\w+-])?")
 def _named(text: str) -> str:
     if not NAME.fullmatch(text):
         raise ValueError(
-            "a name has up to 100 letters, digits, spaces and _ . + -, a letter or digit at each end"
+            "a name is up to 100 letters, digits, spaces and _ . + -, letters or digits at its ends"
         )
     return text
+
+
+def _ascending(values: tuple) -> tuple:
+    if any(low > high for low, high in pairwise(values)):
+        raise ValueError("should not fall from one to the next")
+    return values
 
 
 def _once(values: tuple) -> tuple:
@@ -61,6 +68,8 @@ Name = Annotated[str, AfterValidator(_named)]
 """What something is called; see `NAME`."""
 Unique = AfterValidator(_once)
 """No value of a tuple comes twice: `Annotated[tuple[str, ...], Unique]`."""
+Ascending = AfterValidator(_ascending)
+"""Numbers that do not fall: `Annotated[tuple[Positive, Positive], Ascending]`."""
 LARGEST_RECORD = 20_000_000
 """Bytes of the largest record that is read; a specialist's description has forty thousand."""
 
@@ -72,10 +81,24 @@ def check_fields(config: Any, error: type[FgtutorError] = ConfigError) -> None:
 
     A dataclass calls this in `__post_init__`, so that its values are checked whoever builds it.
     """
-    for name, adapter in _numeric_fields(type(config)).items():
-        value = getattr(config, name)
+    kind = type(config)
+    _check(kind, {name: getattr(config, name) for name in _numeric_fields(kind)}, error)
+
+
+def check_arguments(
+    function: Callable[..., Any], given: Mapping[str, Any], error: type[FgtutorError]
+) -> None:
+    """Raise `error` unless every number and choice in `given` is what the function's types allow.
+
+    A function calls this first, with itself and `locals()`.
+    """
+    _check(function, given, error)
+
+
+def _check(kind: Callable[..., Any], values: Mapping[str, Any], error: type[FgtutorError]) -> None:
+    for name, adapter in _numeric_fields(kind).items():
         try:
-            adapter.validate_python(_plain(value))
+            adapter.validate_python(_plain(values[name]))
         except ValidationError as problem:
             raise error(f"{name}: {_first(problem)}") from None
 
@@ -128,13 +151,16 @@ def arguments(kind: type, base: type = object) -> type:
 
 
 @cache
-def _numeric_fields(kind: type) -> dict[str, TypeAdapter]:
-    """Return a checker for each field of a dataclass that holds numbers or one of some words."""
+def _numeric_fields(kind: Callable[..., Any]) -> dict[str, TypeAdapter]:
+    """Return a checker for each field or argument that is made of numbers or chosen words."""
     hints = get_type_hints(kind, include_extras=True)
+    names = (
+        [f.name for f in fields(kind)] if is_dataclass(kind) else inspect.signature(kind).parameters
+    )
     return {
-        field.name: TypeAdapter(hints[field.name], config=_FINITE)
-        for field in fields(kind)
-        if _is_plain(hints[field.name])
+        name: TypeAdapter(hints[name], config=_FINITE)
+        for name in names
+        if name in hints and _is_plain(hints[name])
     }
 
 
