@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from fgtutor.errors import ConfigError
 from fgtutor.symmetry import Mirror, SymmetricMLP, SymmetricMLPModel, join
+from fgtutor.validation import Width
 
 HISTORY = 5
 """Frames that the policy remembers, the newest included."""
@@ -134,9 +135,9 @@ class DreamWaQModel(SymmetricMLPModel):
     def __init__(
         self,
         *args: Any,
-        history: int = HISTORY,
-        latent: int = 16,
-        context_hidden: Sequence[int] = (128, 64),
+        history: Width = HISTORY,
+        latent: Width = 16,
+        context_hidden: tuple[Width, ...] = (128, 64),
         mirror: Mirror | None = None,
         **kwargs: Any,
     ) -> None:
@@ -168,7 +169,7 @@ class DreamWaQModel(SymmetricMLPModel):
 
     def _get_latent_dim(self) -> int:
         """Return how many numbers the policy's layers read."""
-        if self.obs_dim % self.history:
+        if self.history < 1 or self.obs_dim % self.history:
             raise ConfigError(
                 f"{self.obs_dim} observations are no {self.history} frames of one width: ask the "
                 "environment for as many frames as the policy reads"

@@ -7,15 +7,19 @@ Source: paper, Sec. III-A (Eqs. 1-3) and Sec. III-B (Eq. 4).
 
 import math
 from collections.abc import Mapping
-from typing import overload
+from typing import Annotated, overload
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from fgtutor.errors import ThresholdError
+from fgtutor.validation import Width
 
+HeightScale = Annotated[float, Interval(gt=0, le=1000)]
+"""Units of height per metre."""
 TAU_LOW, TAU_HIGH = 0.1, 2.0
 """The paper's thresholds on L_recon, summed over the patch (Eq. 4)."""
 
@@ -29,13 +33,13 @@ class FeasibilityNet(nn.Module):
 
     def __init__(
         self,
-        num_points: int,
+        num_points: Width,
         *,
-        command_dim: int = 3,
-        hidden: tuple[int, int] = (128, 64),
-        vae_hidden: tuple[int, int] = (256, 128),
-        latent: int = 16,
-        height_scale: float = 4.0,
+        command_dim: Width = 3,
+        hidden: tuple[Width, Width] = (128, 64),
+        vae_hidden: tuple[Width, Width] = (256, 128),
+        latent: Width = 16,
+        height_scale: HeightScale = 4.0,
     ) -> None:
         """Build the head and the two halves of the autoencoder.
 
@@ -142,12 +146,12 @@ def calibrated_taus(quantiles: Mapping[str, float]) -> tuple[float, float]:
     """
     try:
         low, high = float(quantiles["0.9"]), float(quantiles["0.99"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ThresholdError(
             f'calibrated taus need the quantiles "0.9" and "0.99" of L_recon, got '
             f'{dict(quantiles)}: train the specialist again, or use taus="paper"'
         ) from error
-    if not (0 < low < high < math.inf):
+    if not (0 < low < high and 2 * high < math.inf):
         raise ThresholdError(
             f"quantiles of L_recon must be positive and increasing, got q90 = {low}, q99 = {high}: "
             'train the specialist again, or use taus="paper"'

@@ -8,13 +8,16 @@ makes the planner's input look like the training data.
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from jaxtyping import Float
 from torch import Tensor
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
+from fgtutor.validation import check_fields
 
 HOLE_DEPTH = 0.3
 """Depth at which a hole counts as bottomless, m: deeper cells look alike to a patch."""
@@ -23,26 +26,34 @@ HOLE_REACH = 0.25
 further, and the bottom of a valley with walls of 50 degrees would count as one."""
 SPACING = 0.1
 """Distance between neighbouring points of a patch, m."""
+MOST_POINTS = 10_000
+"""Points of the largest patch."""
+Reach = Annotated[float, Interval(ge=0, le=100)]
+"""How far a patch reaches, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PatchGrid:
     """Where a patch is sampled, in the robot's yaw frame (x ahead, y left), metres."""
 
-    ahead: float = 0.8
+    ahead: Reach = 0.8
     """Reach in front of the robot's centre, m."""
-    behind: float = 0.8
+    behind: Reach = 0.8
     """Reach behind the robot's centre, m."""
-    half_width: float = 0.5
+    half_width: Reach = 0.5
     """Reach to either side, m."""
-    spacing: float = SPACING
+    spacing: Annotated[float, Interval(ge=1e-3, le=100)] = SPACING
     """Distance between neighbouring points, m."""
-    footprint: tuple[float, float] = (0.2, 0.1)
+    footprint: tuple[Reach, Reach] = (0.2, 0.1)
     """Half length and half width of the area whose median is the ground under the robot, m."""
 
     def __post_init__(self) -> None:
-        if not (self.spacing > 0 and self.ahead >= 0 and self.behind >= 0 and self.half_width >= 0):
-            raise ConfigError(f"PatchGrid needs spacing > 0 and reaches >= 0, got {self}")
+        check_fields(self)
+        if self.num_points > MOST_POINTS:
+            raise ConfigError(
+                f"{self} has {self.num_points} points, more than {MOST_POINTS}: take a larger "
+                "spacing or a smaller patch"
+            )
         if not self.footprint_index.numel():
             raise ConfigError(
                 f"no patch point lies under the footprint {self.footprint}: enlarge it"

@@ -7,38 +7,59 @@ zoo adds one. Source: the pairs (pi_i, F_i) of the paper, Sec. III-C.
 
 import hashlib
 import json
-import math
 import os
+import re
 import secrets
 import shutil
+import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import safetensors.torch
 import torch
+from annotated_types import Interval
 from rsl_rl.models import MLPModel
-from safetensors import SafetensorError
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from fgtutor.errors import SpecialistError
+from fgtutor.errors import FgtutorError, SpecialistError
 from fgtutor.feasibility import FeasibilityNet
 from fgtutor.patches import PatchGrid
 from fgtutor.policies import PolicyConfig
+from fgtutor.specialist_folder import (
+    CURE,
+    DESCRIPTION,
+    SCHEMA,
+    TENSORS,
+    Description,
+    Known,
+    Speed,
+    build_networks,
+    check_quantiles,
+    compare,
+    read_description,
+    read_tensors,
+    sizes_of,
+)
+from fgtutor.specialist_folder import checksum as _checksum
 from fgtutor.storage import atomic_write, storage_error
+from fgtutor.symmetry import SymmetricMLP
+from fgtutor.validation import (
+    NAME,
+    Name,
+    check_fields,
+    parse_record,
+)
 
-SCHEMA = 1
-"""Version of `specialist.json`; a reader refuses any other."""
 ZOO = Path(__file__).parent / "zoo"
 """The shipped specialists: one folder <robot>/<name> each."""
 GENERAL = "general"
 """Name of the baseline trained on every terrain; it lies in the zoo but is no specialist."""
-DESCRIPTION = "specialist.json"
-"""The file that describes the other two and holds their checksums."""
-_CURE = "restore the folder from where it came, or train the specialist again"
-_TENSORS = ("policy.safetensors", "feasibility.safetensors")
+STALE_SECONDS = 3600
+"""Age from which a hidden folder is known to be what a killed save left, s."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,9 +70,9 @@ class Specialist:
         SpecialistError: The parts do not fit together.
     """
 
-    name: str
+    name: Name
     """What routes and figures call it; in a zoo, the name of its folder."""
-    robot: str
+    robot: Name
     """The robot it drives: "toy" or "a1"."""
     policy: MLPModel
     """pi_i: observations to actions."""
@@ -59,27 +80,34 @@ class Specialist:
     """F_i: patch and command to feasibility, and L_recon."""
     grid: PatchGrid
     """Where its patches are sampled."""
-    command: tuple[float, float, float]
-    """Velocity (vx, vy, wz) that planning asks about, in the yaw frame; m/s, m/s, rad/s."""
-    label_seconds: float
+    command: tuple[Speed, Speed, Speed]
+    """Velocity (vx, vy, wz) that planning asks about, in the yaw frame; m/s, m/s, rad/s. It goes
+    ahead, since patches look along the heading."""
+    label_seconds: Annotated[float, Interval(ge=0, le=3600)]
     """Seconds over which r_v was averaged into the label; 0 is the paper's instantaneous r_v."""
     quantiles: Mapping[str, float]
-    """Quantiles of L_recon on its own terrain, m^2, by probability ("0.95": ...)."""
+    """Quantiles of L_recon on its own terrain, in the Feasibility-Net's scaled units, by
+    probability ("0.95": ...)."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """Where it came from: terrain, samples, seed, package versions; kept as JSON keeps it."""
 
     def __post_init__(self) -> None:
+        check_fields(self, SpecialistError)
         if self.feasibility.num_points != self.grid.num_points:
             raise SpecialistError(
                 f"{self.name}: the Feasibility-Net reads {self.feasibility.num_points} points, "
                 f"the patch grid gives {self.grid.num_points}; build both from one PatchGrid"
             )
-        numbers = (*self.command, self.label_seconds, *self.quantiles.values())
-        if len(self.command) != 3 or not all(math.isfinite(number) for number in numbers):
+        if self.feasibility.command_dim != len(self.command):
             raise SpecialistError(
-                f"{self.name}: expected three finite numbers as command and finite label seconds "
-                f"and quantiles, got {self.command}, {self.label_seconds}, {dict(self.quantiles)}"
+                f"{self.name}: the Feasibility-Net reads {self.feasibility.command_dim} numbers of "
+                f"a command, a command has {len(self.command)}"
             )
+        if self.command[0] <= 0:
+            raise SpecialistError(f"command: 0: should go ahead, got {self.command}")
+        check_quantiles(self.quantiles)
+        known = {k: v for k, v in self.provenance.items() if k in Known.__annotations__}
+        parse_record(Known, known, SpecialistError, "provenance")
 
     def __repr__(self) -> str:
         """Say in one line what a person wants to know about it."""
@@ -122,17 +150,21 @@ def save_specialist(specialist: Specialist, folder: str | Path) -> Path:
         StorageError: The system refused to write; nothing partial is left.
     """
     folder = Path(folder).absolute()
+    if folder.is_symlink():  # it goes on showing where it did
+        folder = Path(os.path.realpath(folder))
     if folder.is_dir() and any(folder.iterdir()) and not (folder / DESCRIPTION).is_file():
         raise SpecialistError(f"{folder} holds something else: choose another folder")
-    # Filled into what a reader will build: a folder that cannot be loaded is never written.
-    modules = (specialist.policy, specialist.feasibility)
-    twins = _build(PolicyConfig.of(specialist.policy), _numbers(specialist.feasibility))
+    where = specialist.name
+    # Compared with what a reader will build: a folder that cannot be loaded is never written.
+    config, sizes = PolicyConfig.of(specialist.policy), sizes_of(specialist.feasibility)
+    twins = build_networks(config, sizes, "meta", where)
     payloads = {}
-    for file, module, twin in zip(_TENSORS, modules, twins, strict=True):
+    for file, module, twin in zip(TENSORS, _modules(specialist), twins, strict=True):
         state = {k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}
-        _fill(twin, state, f"{specialist.name}'s {file}")
+        compare(twin, state, f"{where} {file}")
         payloads[file] = safetensors.torch.save(state)
     payloads[DESCRIPTION] = _describe(specialist, payloads)
+    parse_record(Description, payloads[DESCRIPTION], SpecialistError, f"{where} {DESCRIPTION}")
 
     stamp = secrets.token_hex(4)
     fresh = folder.with_name(f".{folder.name}.{stamp}.new")
@@ -153,7 +185,7 @@ def save_specialist(specialist: Specialist, folder: str | Path) -> Path:
         if isinstance(error, OSError):
             raise storage_error(folder, error) from error
         raise
-    shutil.rmtree(previous, ignore_errors=True)
+    _remove_leftovers(folder)
     return folder
 
 
@@ -170,32 +202,33 @@ def load_specialist(folder: str | Path) -> Specialist:
             f"no specialist folder {folder}: check the path, or train one with `fgtutor train`"
         )
     path = folder / DESCRIPTION
-    description = _read_description(path)
-    payloads = {file: _read_tensors(folder / file, description) for file in _TENSORS}
+    told = read_description(path)
+    # Built without memory first: what the description claims may be larger than any machine.
+    twins = build_networks(told.policy, told.feasibility, "meta", str(path))
+    tensors = [
+        read_tensors(folder / file, told, twin) for file, twin in zip(TENSORS, twins, strict=True)
+    ]
+    policy, feasibility = build_networks(told.policy, told.feasibility, "cpu", str(path))
     try:
-        grid = dict(description["grid"])
-        grid["footprint"] = tuple(grid["footprint"])
-        config = PolicyConfig(**description["policy"])
-        policy, feasibility = _build(config, description["feasibility"])
-        vx, vy, wz = description["command"]
         specialist = Specialist(
-            name=str(description["name"]),
-            robot=str(description["robot"]),
+            name=told.name,
+            robot=told.robot,
             policy=policy,
             feasibility=feasibility,
-            grid=PatchGrid(**grid),
-            command=(float(vx), float(vy), float(wz)),
-            label_seconds=float(description["label_seconds"]),
-            quantiles={str(k): float(v) for k, v in description["quantiles"].items()},
-            provenance=dict(description["provenance"]),
+            grid=told.grid,
+            command=told.command,
+            label_seconds=told.label_seconds,
+            quantiles=told.quantiles,
+            provenance=told.provenance,
         )
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        raise SpecialistError(
-            f"{path} does not follow schema {SCHEMA} ({type(error).__name__}: {error}): {_CURE}"
-        ) from error
-    for module, file in zip((policy, feasibility), _TENSORS, strict=True):
-        _fill(module, payloads[file], str(folder / file))
-        module.eval().requires_grad_(False)
+        for module, state in zip(_modules(specialist), tensors, strict=True):
+            module.load_state_dict(state)
+            module.eval().requires_grad_(False)
+            for part in module.modules():
+                if isinstance(part, SymmetricMLP):
+                    part.find_mirror()
+    except FgtutorError as error:
+        raise SpecialistError(f"{path}: {error}: {CURE}") from error
     return specialist
 
 
@@ -212,16 +245,25 @@ def load_zoo(
             or drives another robot.
     """
     home = ZOO / robot if folder is None else Path(folder)
+    try:
+        paths = sorted(home.iterdir()) if home.is_dir() else []
+    except OSError as error:
+        raise SpecialistError(f"cannot read the zoo {home}: {error.strerror}") from error
     if not home.is_dir():
         shipped = sorted(path.name for path in ZOO.glob("*") if any(path.glob(f"*/{DESCRIPTION}")))
         raise SpecialistError(
             f"no zoo for robot {robot!r} at {home}: robots with a shipped zoo are {shipped}"
         )
     zoo = {}
-    for path in sorted(home.iterdir()):
+    for path in paths:
         wanted = path.is_dir() and not path.name.startswith((".", "_"))
         if not wanted or (path.name == GENERAL and not include_general):
             continue
+        if not NAME.fullmatch(path.name):
+            raise SpecialistError(
+                f"a folder of the zoo {home} is called {path.name!r}: rename it with letters, "
+                "digits, spaces and _ . + -, since that is what tables and routes call it"
+            )
         zoo[path.name] = specialist = replace(load_specialist(path), name=path.name)
         if specialist.robot != robot:
             raise SpecialistError(
@@ -234,16 +276,9 @@ def load_zoo(
     return zoo
 
 
-def _numbers(net: FeasibilityNet) -> dict[str, Any]:
-    """Return the arguments that build a Feasibility-Net of this size."""
-    names = ("num_points", "command_dim", "hidden", "vae_hidden", "latent", "height_scale")
-    return {name: getattr(net, name) for name in names}
-
-
-def _build(config: PolicyConfig, numbers: dict[str, Any]) -> tuple[MLPModel, FeasibilityNet]:
-    """Build both networks; torch's random state stays, so that a save changes no training."""
-    with torch.random.fork_rng(devices=[]):
-        return config.build(), FeasibilityNet(**numbers)
+def _modules(specialist: Specialist) -> tuple[nn.Module, nn.Module]:
+    """Return both networks, in the order of `TENSORS`."""
+    return specialist.policy, specialist.feasibility
 
 
 def _describe(specialist: Specialist, payloads: Mapping[str, bytes]) -> bytes:
@@ -253,7 +288,7 @@ def _describe(specialist: Specialist, payloads: Mapping[str, bytes]) -> bytes:
         "name": specialist.name,
         "robot": specialist.robot,
         "policy": asdict(PolicyConfig.of(specialist.policy)),
-        "feasibility": _numbers(specialist.feasibility),
+        "feasibility": sizes_of(specialist.feasibility),
         "grid": asdict(specialist.grid),
         "command": specialist.command,
         "label_seconds": specialist.label_seconds,
@@ -274,69 +309,12 @@ def _describe(specialist: Specialist, payloads: Mapping[str, bytes]) -> bytes:
         ) from error
 
 
-def _checksum(description: Mapping[str, Any]) -> str:
-    """Return the sha256 of a description without its own checksum, independent of its layout."""
-    content = {key: value for key, value in description.items() if key != "checksum"}
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _read_description(path: Path) -> dict[str, Any]:
-    """Read `specialist.json`, verifying its schema version and its own checksum."""
-    try:
-        description = json.loads(path.read_bytes())
-        if not isinstance(description, dict):
-            raise TypeError(f"expected an object, got a {type(description).__name__}")
-        schema, stored = description.get("schema"), description.get("checksum")
-        computed = _checksum(description)
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise SpecialistError(f"cannot read {path} ({error}): {_CURE}") from error
-    if schema != SCHEMA:
-        raise SpecialistError(
-            f"{path} has schema {schema!r}, this fgtutor reads {SCHEMA}: install the fgtutor that "
-            "wrote it, or train the specialist again"
-        )
-    if stored != computed:
-        raise SpecialistError(f"{path} was altered, its checksum does not match: {_CURE}")
-    return description
-
-
-def _read_tensors(path: Path, description: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Read one safetensors file, verifying its size and sha256 before it is parsed."""
-    try:
-        payload = path.read_bytes()
-        expected = description["files"][path.name]
-        size, digest = expected["bytes"], expected["sha256"]
-    except OSError as error:
-        raise SpecialistError(f"cannot read {path} ({error}): {_CURE}") from error
-    except (KeyError, TypeError) as error:
-        raise SpecialistError(
-            f"{path.parent / DESCRIPTION} lists no {path.name}: {_CURE}"
-        ) from error
-    if len(payload) != size:
-        raise SpecialistError(f"{path} has {len(payload)} bytes, expected {size}: {_CURE}")
-    if hashlib.sha256(payload).hexdigest() != digest:
-        raise SpecialistError(f"{path} was altered, its sha256 does not match: {_CURE}")
-    try:
-        return safetensors.torch.load(payload)
-    except (SafetensorError, ValueError, KeyError) as error:
-        raise SpecialistError(f"{path} is not a safetensors file ({error}): {_CURE}") from error
-
-
-def _fill(module: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
-    """Load tensors into a module, which they must match in names, shapes and types."""
-    expected = {k: (tuple(v.shape), v.dtype) for k, v in module.state_dict().items()}
-    got = {k: (tuple(v.shape), v.dtype) for k, v in tensors.items()}
-    wrong = sorted(k for k in expected.keys() | got.keys() if expected.get(k) != got.get(k))
-    if wrong:
-        raise SpecialistError(
-            f"{where}: tensor {wrong[0]!r} should be {expected.get(wrong[0], 'absent')}, is "
-            f"{got.get(wrong[0], 'absent')}: the description is of another network"
-        )
-    for name, value in tensors.items():
-        if not torch.isfinite(value).all():
-            raise SpecialistError(
-                f"{where}: tensor {name!r} holds a NaN or an infinity: the training diverged, "
-                "train again with a lower learning rate"
-            )
-    module.load_state_dict(dict(tensors))
+def _remove_leftovers(folder: Path) -> None:
+    """Remove the folder's earlier version, and what killed saves have left beside it."""
+    hidden = re.compile(re.escape(f".{folder.name}.") + r"[0-9a-f]{8}\.(new|old)")
+    with suppress(OSError):
+        for path in folder.parent.iterdir():
+            found = hidden.fullmatch(path.name)
+            # Another process may just be writing a fresh one.
+            if found and (found[1] == "old" or time.time() - path.stat().st_mtime > STALE_SECONDS):
+                shutil.rmtree(path, ignore_errors=True)

@@ -42,9 +42,10 @@ class Mirror:
                 for i, j in enumerate(index)
             )
             if not twice:
+                got = f"{index} and {sign}"
                 raise ConfigError(
                     f"the mirrored {what} mirrored again must be the {what} itself: pair every "
-                    f"index with the one it names and use signs +1 or -1, got {index} and {sign}"
+                    f"index with the one it names and use signs +1 or -1, got {got:.200}"
                 )
 
     def part(self, keep: Sequence[int]) -> Self:
@@ -112,6 +113,11 @@ class SymmetricMLP(MLP):
         answer = self.plain(x)
         twin = self.plain(x.index_select(-1, self.observation_index) * self.observation_sign)
         return 0.5 * (answer + twin.index_select(-1, self.action_index) * self.action_sign)
+
+    def find_mirror(self) -> Mirror:
+        """Return the mirror; raises `ConfigError` if the state that was loaded holds none."""
+        names = ("observation_index", "observation_sign", "action_index", "action_sign")
+        return Mirror(**{name: tuple(getattr(self, name).tolist()) for name in names})
 
     def plain(self, x: Tensor) -> Tensor:
         """Return the answer of the network as it is."""

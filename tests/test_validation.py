@@ -69,7 +69,7 @@ class Record:
         ("name", "M\udcff", "name: "),
         ("name", "../steps", "letters, digits"),
         ("name", "..", "letters, digits"),
-        ("name", "a ", "at each end"),
+        ("name", "a ", "at its ends"),
         ("name", "", "letters, digits"),
         ("name", "a" * 101, "letters, digits"),
         ("terrains", ("a", "b", "a"), "only once, 'a' is there twice"),
