@@ -5,8 +5,13 @@ only when chosen, so that `fgtutor --help` answers at once.
 """
 
 import importlib
+import io
+import os
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any
 
 from fgtutor import __version__
 from fgtutor.errors import FgtutorError
@@ -59,8 +64,9 @@ COMMANDS = {
 }
 """Command: module under fgtutor, its config dataclass (or what picks it), what it is for."""
 
-USAGE, INTERRUPTED = 2, 130
-"""Exit codes: a mistake that the message explains; Ctrl-C (128 + SIGINT, as shells report it)."""
+USAGE, INTERRUPTED, TERMINATED, UNREAD = 2, 130, 143, 141
+"""Exit codes: a mistake that the message explains; then, as shells report them, 128 + SIGINT
+(Ctrl-C), SIGTERM, and SIGPIPE: whoever read the output has stopped reading."""
 
 
 def overview() -> str:
@@ -80,6 +86,8 @@ def overview() -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a file's name may be no text
     command = next((name for name in COMMANDS if words[: len(name.split())] == name.split()), None)
     if command is not None:
         return _run(command, words[len(command.split()) :])
@@ -98,22 +106,54 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(command: str, options: Sequence[str]) -> int:
     """Import a command's module, let tyro fill its dataclass, and run it."""
-    import tyro  # here, because `fgtutor --help` needs none of it
-
     module_name, config_name, _ = COMMANDS[command]
     try:
+        from fgtutor.validation import parse_options  # here: `fgtutor --help` needs none of it
+
         module = importlib.import_module(f"fgtutor.{module_name}")
         config_class = getattr(module, config_name)
         if not isinstance(config_class, type):
             config_class = config_class(options)
-        config = tyro.cli(config_class, args=options, prog=f"fgtutor {command}")
-        return module.run(config) or 0
+        config = parse_options(config_class, options, f"fgtutor {command}")
+        with _ends_in_order():
+            return module.run(config) or 0
     except FgtutorError as error:
         print(f"fgtutor {command}: {error}", file=sys.stderr)
+        return USAGE
+    except ModuleNotFoundError as error:
+        print(
+            f"fgtutor {command}: the package {error.name} is not installed; in the clone of "
+            "fgtutor, pip install --constraint constraints.txt --editable '.[lab]' installs what "
+            "the commands need",
+            file=sys.stderr,
+        )
         return USAGE
     except KeyboardInterrupt:
         print(f"fgtutor {command}: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except BrokenPipeError:
+        # Python writes what is left when it ends, and would complain once more.
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNREAD
+
+
+@contextmanager
+def _ends_in_order() -> Iterator[None]:
+    """Let SIGTERM end the command as an exception does: files half written are removed."""
+
+    def end(*_: Any) -> None:
+        raise SystemExit(TERMINATED)
+
+    try:
+        before = signal.signal(signal.SIGTERM, end)
+    except ValueError:  # not the main thread, where no signal arrives
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 if __name__ == "__main__":

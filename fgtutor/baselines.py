@@ -11,9 +11,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
@@ -26,7 +28,10 @@ from fgtutor.pipeline import plan_on_map
 from fgtutor.routes import Route
 from fgtutor.specialist import GENERAL, Specialist
 from fgtutor.tensorization import Assessment, Taus, assess_all, resolve_taus, steps_on_known
+from fgtutor.validation import Count, Positive, check_fields
 
+Radius = Annotated[float, Interval(ge=0, le=10)]
+"""How far something reaches, m."""
 OURS = "ours"
 """The paper's planner: all specialists, fused."""
 
@@ -35,31 +40,37 @@ OURS = "ours"
 class TraversabilityConfig:
     """What the classical traversability counts as critical; a cell that reaches it is closed."""
 
-    slope: float = 1.0
+    slope: Annotated[float, Interval(gt=0, le=math.pi / 2)] = 1.0
     """Critical slope, rad (slopeFilter)."""
-    step: float = 0.12
+    step: Positive = 0.12
     """Critical height of a step, m (stepFilter)."""
-    step_cells: int = 4
+    step_cells: Count = 4
     """Cells with a critical step that it takes to close a cell (stepFilter)."""
-    step_radius: float = 0.04
+    step_radius: Radius = 0.04
     """Radius of both windows of the step, m (stepFilter)."""
-    roughness: float = 0.05
+    roughness: Positive = 0.05
     """Critical standard deviation from the plane, m (roughnessFilter)."""
-    plane_radius: float = 0.05
+    plane_radius: Radius = 0.05
     """Radius in which the plane is fitted, m (surfaceNormalsFilter, roughnessFilter)."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OccupancyConfig:
     """What an occupancy grid calls an obstacle, and how it is inflated."""
 
-    step: float = 0.12
+    step: Positive = 0.12
     """A cell is lethal where the heights of it and its 8 neighbours differ by more, m. Nav2 knows
     flat floors only; this is the critical step of `TraversabilityConfig`."""
-    inflation_radius: float = 0.55
+    inflation_radius: Radius = 0.55
     """How far an obstacle costs anything, m (Nav2's default)."""
-    cost_scaling: float = 10.0
+    cost_scaling: Annotated[float, Interval(gt=0, le=1000)] = 10.0
     """How fast the cost decays, 1/m (Nav2's default)."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def traversability(

@@ -11,6 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fgtutor.elevation import ElevationMap
+from fgtutor.errors import TerrainError
+
+MOST_CELLS = 20_000_000
+"""Cells of the largest map that boxes are rasterised to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +62,14 @@ def rasterise(boxes: Sequence[Box], size: tuple[float, float], resolution: float
 
     The vertical line through a centre meets a box where it is inside all three pairs of faces (the
     slab test for rays); the upper end of that interval is the height. Cells without a box are NaN.
+    Raises `TerrainError` if the map would have more than `MOST_CELLS` cells.
     """
     nx, ny = (round(length / resolution) for length in size)
+    if nx * ny > MOST_CELLS:
+        raise TerrainError(
+            f"a terrain of {size[0]:g} x {size[1]:g} m with cells of {resolution:g} m has "
+            f"{nx * ny} cells, more than {MOST_CELLS}: choose larger cells or a smaller terrain"
+        )
     heights = np.full((nx, ny), -np.inf)
     for box in boxes:
         # Only the cells under the box's bounding rectangle, one more to each side.

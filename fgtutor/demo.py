@@ -21,6 +21,7 @@ from fgtutor.teach.figures import plan_figure, save_figure
 from fgtutor.teach.videos import film_strip, save_video
 from fgtutor.tensorization import assess_all, resolve_taus, steps_on_known
 from fgtutor.terrain import Terrain, make_terrain
+from fgtutor.validation import NonNegative, Seed, check_fields
 
 ROBOT = "a1"
 """The robot that the demo shows unless told otherwise."""
@@ -40,16 +41,19 @@ class DemoConfig:
     """The A1 in MuJoCo, or the toy, which needs no graphics library."""
     out: Path = Path("demo")
     """Folder that the pictures are written to."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the robot's start position and yaw."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped ones."""
     taus: Literal["paper", "calibrated"] = "calibrated"
     """Thresholds of w_ood: the paper's, or each specialist's own."""
-    switch_cost: float = 1.0
+    switch_cost: NonNegative = 1.0
     """Extra cost of changing the policy; at the paper's 0 equals take turns from cell to cell."""
     video: Literal["mp4", "gif"] = "mp4"
     """Format of the film."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def run(config: DemoConfig) -> int:

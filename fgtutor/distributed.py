@@ -12,8 +12,13 @@ import os
 from collections.abc import Iterator
 from typing import Any, TypeVar
 
+# rsl_rl's logger imports GitPython, which otherwise refuses to load where git is not installed.
+os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+
 import torch
 from rsl_rl.runners import OnPolicyRunner
+
+from fgtutor.errors import ConfigError
 
 T = TypeVar("T")
 SEED_STRIDE = 1_000_003
@@ -37,7 +42,7 @@ def leads() -> bool:
 
 def own_seed(seed: int) -> int:
     """Return this process's seed: its robots, its ground and its noise are its own."""
-    return seed + SEED_STRIDE * rank()
+    return (seed + SEED_STRIDE * rank()) % 2**32
 
 
 def own_device(device: str) -> str:
@@ -45,6 +50,15 @@ def own_device(device: str) -> str:
     if processes() > 1 and device.startswith("cuda"):
         return f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
     return device
+
+
+def check_device(device: str) -> None:
+    """Raise `ConfigError` if this machine has no such device."""
+    gpus = [f"cuda:{index}" for index in range(torch.cuda.device_count())]
+    if device not in ("cpu", *gpus, *(["cuda"] if gpus else [])):
+        raise ConfigError(
+            f"there is no device {device} here: choose of {', '.join(('cpu', *gpus))}"
+        )
 
 
 def gather(value: T) -> list[T]:

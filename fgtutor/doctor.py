@@ -14,11 +14,15 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from annotated_types import Interval
 
 from fgtutor import __version__
 from fgtutor.errors import FgtutorError
+from fgtutor.machine import usable_cores
 from fgtutor.robots import GL_BACKENDS
+from fgtutor.validation import check_fields
 
 ESSENTIAL = (
     "torch",
@@ -34,8 +38,16 @@ ESSENTIAL = (
     "tyro",
 )
 """Packages without which the toy pipeline or the A1 does not run."""
-OPTIONAL = ("jupyterlab", "ipywidgets", "anywidget")
-"""Packages of the notebooks: `pip install 'fgtutor[lab]'`."""
+EXTRAS = {
+    "lab": (
+        "the notebooks",
+        ("jupyterlab", "ipywidgets", "anywidget", "ipykernel", "jupytext", "nbclient"),
+    ),
+    "cluster": ("evaluations and sweeps on a Ray cluster", ("ray",)),
+}
+"""What each extra is for, and its packages: `pip install 'fgtutor[lab]'`."""
+INSTALL = "pip install --constraint constraints.txt --editable"
+"""Said in the clone of fgtutor, this installs what is missing."""
 LOW_DISK, LOW_MEMORY = 2.0, 4.0
 """Below these many GB a training's checkpoints, or two trainings side by side, may not fit."""
 
@@ -61,8 +73,11 @@ class DoctorConfig:
     """Folder of the zoo: <robot>/<specialist>."""
     gl: bool = True
     """Whether to try drawing with MuJoCo, in a process of its own."""
-    gl_seconds: float = 60.0
+    gl_seconds: Annotated[float, Interval(gt=0, le=3600)] = 60.0
     """How long one drawing backend may take, s."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,15 +125,28 @@ def report(findings: list[Finding]) -> str:
 
 
 def _packages() -> Iterator[Finding]:
-    """Look up the versions of the packages; those of the notebooks may be absent."""
-    install = "pip install --constraint constraints.txt --editable"
-    for name in (*ESSENTIAL, *OPTIONAL):
-        try:
-            yield Finding(what=name, value=importlib.metadata.version(name))
-        except importlib.metadata.PackageNotFoundError:
-            fix = f"{install} ." if name in ESSENTIAL else f"for the notebooks: {install} '.[lab]'"
-            state = "broken" if name in ESSENTIAL else "note"
-            yield Finding(what=name, value="not installed", state=state, fix=fix)
+    """Look up the versions of the packages, and which of each extra are there."""
+    for name in ESSENTIAL:
+        if found := _version(name):
+            yield Finding(what=name, value=found)
+        else:
+            yield Finding(what=name, value="not installed", state="broken", fix=f"{INSTALL} .")
+    for extra, (use, names) in EXTRAS.items():
+        what, found = f"extra {extra}", [f"{name} {v}" for name in names if (v := _version(name))]
+        if len(found) == len(names):
+            yield Finding(what=what, value=", ".join(found))
+        else:
+            absent = ", ".join(name for name in names if not _version(name))
+            fix = f"for {use}: {INSTALL} '.[{extra}]'"
+            yield Finding(what=what, value=f"without {absent}", state="note", fix=fix)
+
+
+def _version(package: str) -> str | None:
+    """Return the version of an installed package, or None."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def _torch() -> Iterator[Finding]:
@@ -140,9 +168,7 @@ def _torch() -> Iterator[Finding]:
 
 
 def _cores() -> Finding:
-    # A container or a batch system may leave this process fewer cores than the machine has.
-    usable = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-    return Finding(what="cores", value=f"{usable} usable of {os.cpu_count()}")
+    return Finding(what="cores", value=f"{usable_cores()} usable of {os.cpu_count()}")
 
 
 def _memory() -> Finding:
@@ -191,7 +217,7 @@ def probe_gl(backend: str, seconds: float) -> str | None:
     """Return why MuJoCo cannot draw with this backend, or None if it can."""
     try:
         done = subprocess.run(
-            [sys.executable, "-c", _RENDER],
+            [sys.executable, "-P", "-c", _RENDER],
             env={**os.environ, "MUJOCO_GL": backend},
             capture_output=True,
             text=True,

@@ -29,6 +29,10 @@ class CheckpointError(FgtutorError):
     """A training checkpoint cannot be resumed: corrupt, or of another robot, terrain or config."""
 
 
+class DivergedError(FgtutorError):
+    """A training's numbers are no longer finite; its last checkpoint is as it was."""
+
+
 class StorageError(FgtutorError):
     """A file could not be written (full disk, read-only folder); nothing partial is left."""
 
@@ -67,6 +71,10 @@ class RenderingError(FgtutorError):
 
 class NotebookError(FgtutorError):
     """A notebook of the course could not be built from its source."""
+
+
+class GradingError(FgtutorError):
+    """A submission could not be run, by no fault of its own: a busy machine, or one without room."""
 
 
 class CloudError(FgtutorError):

@@ -115,8 +115,8 @@ def compare(model: onnx.ModelProto, policy: MLPModel, *, samples: int = 256) -> 
     Raises:
         ExportError: By more than `TOLERANCE`, or one is not a number.
     """
-    dice = np.random.default_rng(0)
-    observations = dice.standard_normal((samples, policy.obs_dim)).astype(np.float32)
+    rng = np.random.default_rng(0)
+    observations = rng.standard_normal((samples, policy.obs_dim)).astype(np.float32)
     (answers,) = ReferenceEvaluator(model).run(None, {"observation": observations})
     wanted = _answer(policy, torch.from_numpy(observations)).numpy()
     difference = float(np.abs(np.asarray(answers) - wanted).max())

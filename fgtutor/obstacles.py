@@ -1,6 +1,6 @@
 """The obstacles that terrains are made of, and how large they are for each robot.
 
-Reads a `TerrainScale`, a difficulty and dice; gives boxes laid over the full width of a corridor.
+Reads a `TerrainScale`, a difficulty and an rng; gives boxes laid over the full width of a corridor.
 Kinds: the paper's steps, gaps, bridge and valley (Sec. IV-A), and slopes, stairs and rubble.
 """
 
@@ -8,73 +8,91 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 
 from fgtutor.boxes import Box
+from fgtutor.errors import TerrainError
+from fgtutor.validation import Ascending, Share, check_fields
+
+Resolution = Annotated[float, Interval(ge=0.005, le=0.2)]
+"""Side of a terrain's cell, m: below 5 mm a corridor would have millions of cells."""
+Metres = Annotated[float, Interval(ge=0.05, le=50)]
+"""A length on the ground, m."""
+Lengths = Annotated[tuple[Metres, Metres], Ascending]
+"""The shortest and the longest, m."""
+Height = Annotated[float, Interval(ge=0, le=20)]
+"""A height or a depth, m."""
+Angle = Annotated[float, Interval(gt=0, lt=90)]
+"""A slope against the horizontal, degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainScale:
     """How large one robot's terrains are. A pair (easy, hard) holds at difficulty 0 and 1."""
 
-    resolution: float = 0.05
+    resolution: Resolution = 0.05
     """Side of a cell, m; the edges of all obstacles lie on cell borders."""
-    length: float = 8.0
+    length: Metres = 8.0
     """Length of a terrain with one kind of obstacle, along x, m."""
-    width: float = 4.0
+    width: Metres = 4.0
     """Width of a terrain, along y, m."""
-    apron: float = 1.5
+    apron: Metres = 1.5
     """Length of the flat ground at either end, m; start and goal lie in the middle of it."""
-    chasm_depth: tuple[float, float, float] = (0.03, 0.4, 0.6)
+    chasm_depth: tuple[Height, Height, Height] = (0.03, 0.4, 0.6)
     """Depth of gaps and of the chasm beside a bridge at difficulty 0, 0.7 and 1, m. The first must
     be survivable for a robot that falls in, or nothing is learned; the last is as good as none."""
-    ease: float = 0.2
+    ease: Share = 0.2
     """Share of the full height that steps, stairs and rubble have at difficulty 0."""
-    step_height: tuple[float, float] = (0.05, 0.15)
+    step_height: Annotated[tuple[Height, Height], Ascending] = (0.05, 0.15)
     """Lowest and highest riser at difficulty 1, m."""
-    step_tread: tuple[float, float] = (0.35, 0.65)
+    step_tread: Lengths = (0.35, 0.65)
     """Shortest and longest tread of a flight of steps, m."""
-    block_share: float = 0.4
+    block_share: Share = 0.4
     """Share of fields of blocks among steps; the others are flights."""
-    lane_share: float = 0.4
+    lane_share: Share = 0.4
     """Share of flights and hills that differ between a left and a right lane."""
-    bank_share: float = 0.5
+    bank_share: Share = 0.5
     """Share of hills whose plateau is banked sideways."""
-    gap_width: tuple[float, float] = (0.1, 0.15)
+    gap_width: tuple[Metres, Metres] = (0.1, 0.15)
     """Width of a gap, m."""
-    platform: tuple[float, float] = (0.8, 1.6)
+    platform: Lengths = (0.8, 1.6)
     """Shortest and longest platform between two gaps, m."""
-    bridge_width: tuple[float, float] = (1.2, 0.35)
+    bridge_width: tuple[Metres, Metres] = (1.2, 0.35)
     """Width of the beam, m."""
-    bridge_length: float = 3.0
+    bridge_length: Metres = 3.0
     """Length of the beam, m."""
-    valley_angle: tuple[float, float] = (15.0, 50.0)
+    valley_angle: tuple[Angle, Angle] = (15.0, 50.0)
     """Slope of the valley's walls against the horizontal, degrees."""
-    valley_length: float = 3.0
+    valley_length: Metres = 3.0
     """Length of the valley, m."""
-    valley_height: float = 0.9
+    valley_height: Height = 0.9
     """Height at which the walls end in a plateau, m; less where the terrain ends before."""
-    slope_angle: tuple[float, float] = (6.0, 25.0)
+    slope_angle: tuple[Angle, Angle] = (6.0, 25.0)
     """Steepest ramp, degrees; each ramp draws between half of it and all of it."""
-    slope_height: float = 0.5
+    slope_height: Height = 0.5
     """Highest plateau between two ramps, m."""
-    stair_rise: float = 0.12
+    stair_rise: Height = 0.12
     """Rise of a regular stair at difficulty 1, m."""
-    stair_run: float = 0.3
+    stair_run: Metres = 0.3
     """Depth of a regular stair's tread, m."""
-    rubble_height: float = 0.12
+    rubble_height: Height = 0.12
     """Highest block of rubble at difficulty 1, m."""
-    rubble_size: tuple[float, float] = (0.2, 0.5)
+    rubble_size: Lengths = (0.2, 0.5)
     """Shortest and longest side of a block of rubble, m."""
-    rubble_density: float = 1.5
+    rubble_density: Annotated[float, Interval(ge=0, le=3)] = 1.5
     """Area of all blocks of rubble over the area they lie on; above 1 hardly any ground is left."""
     mixed: tuple[str, ...] = ("steps", "gaps", "bridge", "valley")
     """The obstacles of the mixed terrain; their order is drawn from the seed."""
-    mixed_section: float = 3.0
+    mixed_section: Metres = 3.0
     """Mean length of an obstacle in the mixed terrain, m; each is up to 0.4 m longer or shorter."""
-    mixed_landing: float = 1.0
+    mixed_landing: Metres = 1.0
     """Flat ground between two obstacles of the mixed terrain, m."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, TerrainError)
 
     def longest(self, kind: str) -> float:
         """Return how long an obstacle may be, m."""
@@ -109,12 +127,12 @@ SCALES = {
 
 
 class Course:
-    """A corridor under construction: collects boxes, and knows the scale, difficulty and dice."""
+    """A corridor under construction: collects boxes, and knows the scale, difficulty and rng."""
 
-    def __init__(self, scale: TerrainScale, difficulty: float, dice: np.random.Generator) -> None:
+    def __init__(self, scale: TerrainScale, difficulty: float, rng: np.random.Generator) -> None:
         self.scale = scale
         self.difficulty = difficulty
-        self.dice = dice
+        self.rng = rng
         self.boxes: list[Box] = []
         self.depth = float(np.interp(difficulty, (0.0, 0.7, 1.0), scale.chasm_depth))
         self.severity = scale.ease + (1 - scale.ease) * difficulty
@@ -128,7 +146,7 @@ class Course:
 
     def draw(self, low: float, high: float) -> float:
         """Draw a length, in whole cells."""
-        return self.snap(self.dice.uniform(low, high))
+        return self.snap(self.rng.uniform(low, high))
 
     def at(self, easy_hard: tuple[float, float]) -> float:
         """Interpolate a pair of the scale to the difficulty."""
@@ -183,16 +201,16 @@ class Course:
 
     def cuts(self, span: float, low: float, high: float) -> list[float]:
         """Return borders from 0 to `span` at random distances between `low` and `high`."""
-        count = max(1, round(span / self.dice.uniform(low, high)))
-        shares = self.dice.uniform(low, high, count)
+        count = max(1, round(span / self.rng.uniform(low, high)))
+        shares = self.rng.uniform(low, high, count)
         borders = np.concatenate(([0.0], np.cumsum(shares) / shares.sum())) * span
         return [self.snap(border) for border in borders]
 
     def lanes(self) -> list[tuple[float, float]]:
         """Return the whole width, or sometimes two lanes with the border beside the middle."""
         width = self.width
-        cut = self.snap(width * (0.5 + self.dice.choice((-1, 1)) * self.dice.uniform(0.15, 0.3)))
-        split = self.dice.random() < self.scale.lane_share
+        cut = self.snap(width * (0.5 + self.rng.choice((-1, 1)) * self.rng.uniform(0.15, 0.3)))
+        split = self.rng.random() < self.scale.lane_share
         return [(0.0, cut), (cut, width)] if split else [(0.0, width)]
 
 
@@ -205,7 +223,7 @@ def _steps(course: Course, x0: float, x1: float) -> float:
     """Lay flights of steps and fields of blocks, one after another, with short landings."""
     borders = course.cuts(x1 - x0, 1.8, 2.8)
     for near, far in pairwise(borders):
-        kind = _blocks if course.dice.random() < course.scale.block_share else _flight
+        kind = _blocks if course.rng.random() < course.scale.block_share else _flight
         # Without a landing, a flight up beside one down would make a riser of twice the height.
         end = far if far == borders[-1] else course.snap(far - 0.4)
         kind(course, x0 + near, x0 + end)
@@ -214,7 +232,7 @@ def _steps(course: Course, x0: float, x1: float) -> float:
 
 
 def _riser(course: Course) -> float:
-    return course.dice.uniform(*course.scale.step_height) * course.severity
+    return course.rng.uniform(*course.scale.step_height) * course.severity
 
 
 def _flight(course: Course, x0: float, x1: float) -> None:
@@ -222,10 +240,10 @@ def _flight(course: Course, x0: float, x1: float) -> None:
     for y0, y1 in course.lanes():
         borders = course.cuts(x1 - x0, *course.scale.step_tread)
         treads = len(borders) - 1
-        sign = course.dice.choice((1, -1), p=(0.7, 0.3))
+        sign = course.rng.choice((1, -1), p=(0.7, 0.3))
         risers = np.array([_riser(course) for _ in range((treads + 1) // 2)])
         up = np.cumsum(risers)
-        down = up[-1] - np.cumsum(course.dice.permutation(risers))[:-1]
+        down = up[-1] - np.cumsum(course.rng.permutation(risers))[:-1]
         plateau = [up[-1]] * (treads % 2 == 0)
         levels = sign * np.concatenate((up, plateau, down))
         for near, far, top in zip(borders, borders[1:], levels, strict=False):
@@ -294,21 +312,21 @@ def _slopes(course: Course, x0: float, x1: float) -> float:
 
 
 def _hill(course: Course, x0: float, x1: float, y0: float, y1: float, *, banked: bool) -> None:
-    dice, scale = course.dice, course.scale
+    rng, scale = course.rng, course.scale
     steepest = course.at(scale.slope_angle)
-    slope_up, slope_down = np.tan(np.radians(steepest * dice.uniform(0.5, 1.0, 2)))
-    plateau = dice.uniform(0.5, 1.0)
-    wanted = dice.uniform(0.6, 1.0) * scale.slope_height
+    slope_up, slope_down = np.tan(np.radians(steepest * rng.uniform(0.5, 1.0, 2)))
+    plateau = rng.uniform(0.5, 1.0)
+    wanted = rng.uniform(0.6, 1.0) * scale.slope_height
     height = min(wanted, (x1 - x0 - plateau) / (1 / slope_up + 1 / slope_down))
     # Rounded up to whole cells: a ramp may be a little flatter than drawn, never steeper.
     top0 = course.snap(x0 + height / slope_up + scale.resolution / 2)
     top1 = course.snap(x1 - height / slope_down - scale.resolution / 2)
-    top = float(height * dice.choice((1, -1), p=(0.7, 0.3)))
+    top = float(height * rng.choice((1, -1), p=(0.7, 0.3)))
     course.ramp_x(x0, top0, y0, y1, 0.0, top)
     course.ramp_x(top1, x1, y0, y1, top, 0.0)
-    tilt = math.tan(math.radians(steepest * dice.uniform(0.15, 0.3))) * dice.choice((-1, 1))
+    tilt = math.tan(math.radians(steepest * rng.uniform(0.15, 0.3))) * rng.choice((-1, 1))
     rise, flat = float(tilt * (y1 - y0) / 2), course.snap(0.2)
-    if banked and dice.random() < scale.bank_share and top1 - top0 > 3 * flat:
+    if banked and rng.random() < scale.bank_share and top1 - top0 > 3 * flat:
         course.block(top0, top0 + flat, y0, y1, top)
         course.ramp_y(top0 + flat, top1 - flat, y0, y1, top - rise, top + rise)
         course.block(top1 - flat, top1, y0, y1, top)
@@ -321,10 +339,10 @@ def _stairs(course: Course, x0: float, x1: float) -> float:
     course.full(x0, x1)
     borders = course.cuts(x1 - x0, 2.4, 4.0)
     for near, far in pairwise(borders):
-        run = course.snap(course.scale.stair_run * course.dice.uniform(1.0, 1.4))
-        rise = course.scale.stair_rise * course.dice.uniform(0.7, 1.0) * course.severity
+        run = course.snap(course.scale.stair_run * course.rng.uniform(1.0, 1.4))
+        rise = course.scale.stair_rise * course.rng.uniform(0.7, 1.0) * course.severity
         most = max(1, int((far - near - 0.5) / (2 * run)))
-        count = int(course.dice.integers(max(1, most - 1), most + 1))
+        count = int(course.rng.integers(max(1, most - 1), most + 1))
         slack = far - near - 0.4 - 2 * run * count
         left = x0 + near + course.draw(0.0, max(slack, 0.0))
         right = x0 + far - course.draw(0.0, max(x0 + far - left - 0.4 - 2 * run * count, 0.0))
@@ -344,7 +362,7 @@ def _rubble(course: Course, x0: float, x1: float) -> float:
         # Blocks may begin before the border and are cut there, or the border would stay bare.
         x = course.draw(x0 - length, x1)
         y = course.draw(-breadth, width)
-        top = course.dice.uniform(0.25, 1.0) * course.scale.rubble_height * course.severity
+        top = course.rng.uniform(0.25, 1.0) * course.scale.rubble_height * course.severity
         course.block(max(x, x0), min(x + length, x1), max(y, 0.0), min(y + breadth, width), top)
     return course.middle
 
@@ -355,10 +373,10 @@ def _gentle(course: Course, x0: float, x1: float) -> float:
     for near, far in pairwise(columns):
         right = course.snap(course.middle - course.draw(0.45, 1.0))
         left = course.snap(course.middle + course.draw(0.45, 1.0))
-        top = course.dice.uniform(0.0, 0.05) * course.severity
+        top = course.rng.uniform(0.0, 0.05) * course.severity
         course.block(x0 + near, x0 + far, right, left, top)
         for y0, y1 in ((0.0, right), (left, course.width)):
-            beside = course.dice.choice((top, course.dice.uniform(0.0, 0.4), -0.4))
+            beside = course.rng.choice((top, course.rng.uniform(0.0, 0.4), -0.4))
             course.block(x0 + near, x0 + far, y0, y1, float(beside))
     return course.middle
 

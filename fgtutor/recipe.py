@@ -6,6 +6,7 @@ Source: paper, Sec. IV (specialists, DreamWaQ's protocol); PPO's sizes were foun
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from annotated_types import Interval, MinLen
 
 from fgtutor.dreamwaq import HISTORY, DreamWaQModel
 from fgtutor.errors import ConfigError
@@ -21,6 +23,28 @@ from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.symmetry import SymmetricMLPModel
 from fgtutor.terrain import SCALES, World, make_terrain
+from fgtutor.validation import Count, CountOrZero, NonNegative, Seed, Share, check_fields
+
+Robots = Annotated[int, Interval(ge=1, le=100_000)]
+"""Robots, or steps of one: as many as memory may hold."""
+Side = Annotated[int, Interval(ge=1, le=1000)]
+"""Terrains along one side of a world."""
+Batch = Annotated[int, Interval(ge=1, le=10**6)]
+"""Samples of one update."""
+Widths = Annotated[tuple[Annotated[int, Interval(ge=1, le=4096)], ...], MinLen(1)]
+"""Widths of a network's hidden layers, at least one."""
+Seconds = Annotated[float, Interval(ge=0, le=60)]
+"""A part of an episode, s."""
+Speed = Annotated[float, Interval(gt=0, le=10)]
+"""A speed at which a robot may be told to go, m/s."""
+Rate = Annotated[float, Interval(gt=0, le=1)]
+"""A learning rate."""
+Std = Annotated[float, Interval(gt=0, le=2)]
+"""A standard deviation of the action noise, which stays below 2."""
+Threads = Annotated[int, Interval(ge=1, le=256)]
+"""Threads of one process; torch ends the process if they are too many for the system."""
+MINI_BATCHES = 4
+"""Parts of a rollout that PPO learns from one after the other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +56,8 @@ class TrainConfig:
     terrain: str = "steps"
     """Terrain to specialise in, or `general` for all of the robot's terrains."""
     out: Path | None = None
-    """Run folder for checkpoints, curves and the specialist; default runs/ROBOT-TERRAIN."""
+    """Run folder for checkpoints, curves and the specialist; default
+    runs/ROBOT-TERRAIN-seedSEED."""
     resume: bool = False
     """Continue from the run folder's checkpoint; with more `iterations`, beyond its end."""
     start_from: Annotated[Path | None, tyro.conf.arg(name="from")] = None
@@ -42,84 +67,84 @@ class TrainConfig:
     actor: Literal["perceptive", "dreamwaq"] = "perceptive"
     """What the policy observes: its body and a scan of the ground, or, blind, a few steps' history
     from which it imagines the ground (the paper's protocol)."""
-    hours: float = 0.0
+    hours: NonNegative = 0.0
     """Stop and save after this many hours; --resume goes on. 0 sets no limit."""
-    iterations: int = 200
+    iterations: Count = 200
     """PPO iterations in all, over which entropy and the Feasibility-Net's learning rate fall."""
-    num_envs: int = 128
+    num_envs: Robots = 128
     """Robots simulated side by side (by each process)."""
-    steps: int = 40
+    steps: Robots = 40
     """Control steps per robot and iteration."""
-    seed: int = 1
+    seed: Seed = 1
     """Seed of everything random."""
-    save_every: int = 25
+    save_every: Count = 25
     """Iterations between checkpoints; each one also starts every episode anew."""
-    label_seconds: float = 1.0
+    label_seconds: Seconds = 1.0
     """Window over which r_v is averaged into a label, s; 0 is the paper's instantaneous label."""
-    rows: int = 6
+    rows: Side = 6
     """Difficulty rows of the training world."""
-    columns: int = 12
+    columns: Side = 12
     """Terrain variants per row."""
-    easiest: float = 0.1
+    easiest: Share = 0.1
     """Difficulty of the first row; that of the last is 1. More for a policy that goes on where
     another stopped."""
-    easiest_at_last: float | None = None
+    easiest_at_last: Annotated[float, Interval(ge=0, lt=1)] | None = None
     """Difficulty to which the first row's rises, a checkpoint at a time, as the robots outgrow it;
     default, or if it lies below `easiest`: it stays."""
-    std_at_last: float | None = None
+    std_at_last: Std | None = None
     """Standard deviation of the action noise that is not exceeded when the first row has risen so
     far; before, in proportion. On a narrow beam nobody learns who is shaken off it."""
-    neighbours: float = 0.0
+    neighbours: Share = 0.0
     """Share of terrains with other obstacles at both ends, a landing away, as on mixed terrain; for
     a kind that mixed terrain has."""
-    planning_speed: float = 0.85
+    planning_speed: Speed = 0.85
     """Forward speed of the command that planning pairs with every patch, m/s."""
-    hidden: tuple[int, ...] = (128, 64)
+    hidden: Widths = (128, 64)
     """Hidden widths of actor and critic."""
-    gamma: float = 0.98
+    gamma: Share = 0.98
     """Discount per control step; at 25 Hz, 0.98 looks two seconds ahead."""
-    learning_rate: float = 1e-3
+    learning_rate: Rate = 1e-3
     """Initial PPO learning rate; adapted to the KL divergence."""
-    entropy: float = 0.003
+    entropy: Share = 0.003
     """PPO entropy coefficient at the start; it falls to zero over the run."""
-    initial_std: float = 0.6
+    initial_std: Std = 0.6
     """Standard deviation of the action noise at the start."""
-    warm_std: float = 0.25
+    warm_std: Std = 0.25
     """The same for a run that starts from a trained policy."""
-    critic_warmup: int = 10
+    critic_warmup: CountOrZero = 10
     """First iterations of such a run in which only the critic learns, since it is new."""
-    feasibility_learning_rate: float = 2e-3
+    feasibility_learning_rate: Rate = 2e-3
     """Adam learning rate of the Feasibility-Net; it falls to a twentieth over the run."""
-    feasibility_batch: int = 512
+    feasibility_batch: Batch = 512
     """Patches per Feasibility-Net update."""
-    feasibility_updates: int = 24
+    feasibility_updates: Side = 24
     """Feasibility-Net updates per iteration, on patches of all rollouts since the checkpoint."""
-    context_learning_rate: float = 1e-3
+    context_learning_rate: Rate = 1e-3
     """Adam learning rate of a blind policy's context encoder."""
-    context_batch: int = 2048
+    context_batch: Batch = 2048
     """Steps per update of the context encoder."""
-    context_updates: int = 16
+    context_updates: Annotated[int, Interval(ge=0, le=1000)] = 16
     """Updates of the context encoder per iteration."""
-    threads: int = 1
+    threads: Threads = 1
     """Torch threads; two trainings side by side with one thread each beat one with two."""
     device: str = "cpu"
     """Where the networks live: cpu, cuda:0, or cuda under torchrun."""
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "num_envs", "steps", "save_every", "rows", "columns", "threads"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("label_seconds", "hours", "critic_warmup"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name} must be 0 or more, got {getattr(self, name)}")
-        for name, what in (("easiest", "difficulty"), ("neighbours", "share")):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be a {what} from 0 to 1, got {getattr(self, name)}")
-        last, quiet = self.easiest_at_last, self.std_at_last
-        if last is not None and not 0 <= last < 1:
-            raise ConfigError(f"easiest_at_last must be a difficulty below 1, got {last:g}")
-        if quiet is not None and (last is None or not quiet > 0):
-            raise ConfigError(f"std_at_last must be above 0 and needs easiest_at_last, got {quiet}")
+        check_fields(self)
+        if self.std_at_last is not None and self.easiest_at_last is None:
+            raise ConfigError("std_at_last needs easiest_at_last, as it falls while that rises")
+        if not re.fullmatch(r"cpu|cuda(:[0-9]{1,3})?", self.device):
+            raise ConfigError(f"device should be cpu, cuda or cuda:NUMBER, got {self.device!r}")
+        try:
+            str(self.folder).encode()
+        except UnicodeEncodeError:
+            raise ConfigError(f"out: {str(self.folder)!r} is no name in UTF-8") from None
+        if self.num_envs * self.steps < MINI_BATCHES:
+            raise ConfigError(
+                f"{self.num_envs} robots with {self.steps} steps make no {MINI_BATCHES} "
+                "mini-batches: set num_envs or steps higher"
+            )
 
     @property
     def first_std(self) -> float:
@@ -129,7 +154,7 @@ class TrainConfig:
     @property
     def folder(self) -> Path:
         """The run folder."""
-        return self.out or Path("runs") / f"{self.robot}-{self.terrain}"
+        return self.out or Path("runs") / f"{self.robot}-{self.terrain}-seed{self.seed}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,20 +163,20 @@ class A1TrainConfig(TrainConfig):
 
     robot: str = "a1"
     terrain: str = "gentle"
-    iterations: int = 500
-    num_envs: int = 640
-    label_seconds: float = 0.8
-    rows: int = 5
-    columns: int = 10
-    easiest_at_last: float | None = 0.85
-    std_at_last: float | None = 0.12
-    neighbours: float = 0.6
-    planning_speed: float = 0.65
-    hidden: tuple[int, ...] = (256, 128)
-    gamma: float = 0.99
-    entropy: float = 0.001
-    initial_std: float = 0.5
-    feasibility_learning_rate: float = 1e-3
+    iterations: Count = 500
+    num_envs: Robots = 640
+    label_seconds: Seconds = 0.8
+    rows: Side = 5
+    columns: Side = 10
+    easiest_at_last: Annotated[float, Interval(ge=0, lt=1)] | None = 0.85
+    std_at_last: Std | None = 0.12
+    neighbours: Share = 0.6
+    planning_speed: Speed = 0.65
+    hidden: Widths = (256, 128)
+    gamma: Share = 0.99
+    entropy: Share = 0.001
+    initial_std: Std = 0.5
+    feasibility_learning_rate: Rate = 1e-3
 
 
 CONFIGS = {"toy": TrainConfig, "a1": A1TrainConfig}
@@ -183,9 +208,9 @@ def training_world(config: TrainConfig, iteration: int = 0) -> World:
     mixed = SCALES[config.robot].mixed
     names = mixed if config.terrain == "general" else (config.terrain,)
     levels = np.linspace(config.easiest, 1.0, config.rows) if config.rows > 1 else np.ones(1)
-    dice = np.random.default_rng((config.seed, iteration))
-    seeds = 2 * dice.integers(2**30, size=(config.rows, config.columns))
-    between = dice.random((config.rows, config.columns)) < config.neighbours
+    rng = np.random.default_rng((config.seed, iteration))
+    seeds = 2 * rng.integers(2**30, size=(config.rows, config.columns))
+    between = rng.random((config.rows, config.columns)) < config.neighbours
     return World(
         [
             [
@@ -244,7 +269,7 @@ def runner_config(config: TrainConfig, env: LocomotionEnv) -> dict[str, Any]:
         "algorithm": {
             "class_name": FeasibilityPPO,
             "num_learning_epochs": 4,
-            "num_mini_batches": 4,
+            "num_mini_batches": MINI_BATCHES,
             "clip_param": 0.2,
             "gamma": config.gamma,
             "lam": 0.95,

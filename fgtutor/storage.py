@@ -8,6 +8,7 @@ import errno
 import json
 import os
 import secrets
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -78,6 +79,45 @@ def make_folder(path: str | Path) -> None:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise storage_error(path, error) from error
+
+
+@contextmanager
+def locked_folder(path: str | Path) -> Iterator[None]:
+    """Make a folder if there is none, and keep other processes out of it for a block.
+
+    The system takes the lock back when the process ends, however it ends. The file `.lock` stays.
+
+    Raises:
+        StorageError: Another process works in the folder, or the system refuses to write there.
+    """
+    make_folder(path)
+    file = Path(path) / ".lock"
+    try:
+        lock = file.open("ab")
+    except OSError as error:
+        raise storage_error(file, error) from error
+    with lock:
+        try:
+            _lock(lock.fileno())
+        except OSError as error:
+            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES, errno.EAGAIN):
+                raise storage_error(file, error) from error
+            raise StorageError(
+                f"another process works in {path}: wait for it to end, or choose another folder"
+            ) from error
+        yield
+
+
+def _lock(file: int) -> None:
+    """Lock an open file for this process alone, or raise OSError at once."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def storage_error(path: str | Path, error: OSError) -> StorageError:

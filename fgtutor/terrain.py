@@ -8,15 +8,17 @@ above. Kinds: the paper's steps, gaps, bridge and valley (Sec. IV-A), and slopes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
+from annotated_types import Ge, Interval
 from jaxtyping import Float
 
 from fgtutor.boxes import Box, boxes_from_elevation, columns, rasterise
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import TerrainError
-from fgtutor.obstacles import OBSTACLES, SCALES, SPREAD, Course, TerrainScale
+from fgtutor.obstacles import OBSTACLES, SCALES, SPREAD, Course, Resolution, TerrainScale
+from fgtutor.validation import Share, check_arguments, check_fields
 
 __all__ = [
     "SCALES",
@@ -123,9 +125,9 @@ def make_terrain(
     name: str,
     *,
     robot: str = "toy",
-    difficulty: float = 1.0,
-    seed: int = 0,
-    resolution: float | None = None,
+    difficulty: Share = 1.0,
+    seed: Annotated[int, Ge(0)] = 0,
+    resolution: Resolution | None = None,
     scale: TerrainScale | None = None,
     neighbours: bool = False,
 ) -> Terrain:
@@ -148,21 +150,16 @@ def make_terrain(
         TerrainError: A name is unknown, a number is out of range, or the mixed terrain has no
             neighbours for this obstacle.
     """
+    check_arguments(make_terrain, locals(), TerrainError)
     if name not in TERRAINS:
         raise TerrainError(f"unknown terrain {name!r}: choose one of {', '.join(TERRAINS)}")
     if robot not in SCALES:
         raise TerrainError(f"unknown robot {robot!r}: choose one of {', '.join(SCALES)}")
-    if not 0 <= difficulty <= 1:
-        raise TerrainError(f"difficulty must lie in [0, 1], got {difficulty}")
-    if seed < 0:
-        raise TerrainError(f"seed must be 0 or more, got {seed}")
     scale = scale or SCALES[robot]
     if resolution is not None:
-        if not 0 < resolution <= 0.2:
-            raise TerrainError(f"resolution must lie in (0, 0.2] m for a terrain, got {resolution}")
         scale = replace(scale, resolution=resolution)
-    dice = np.random.default_rng((seed, TERRAINS.index(name)))
-    course = Course(scale, difficulty, dice)
+    rng = np.random.default_rng((seed, TERRAINS.index(name)))
+    course = Course(scale, difficulty, rng)
     sections: list[Section] = []
     lane: list[Point] = []
     apron, width = course.snap(scale.apron), course.snap(scale.width)
@@ -203,7 +200,7 @@ def make_terrain(
 
 def _plan(course: Course, name: str, apron: float) -> list[tuple[str, float, float]]:
     """Return which obstacle lies from where to where."""
-    scale, dice = course.scale, course.dice
+    scale, rng = course.scale, course.rng
     if name != "mixed":
         room = scale.length - 2 * apron
         if room < 1.0:
@@ -212,14 +209,14 @@ def _plan(course: Course, name: str, apron: float) -> list[tuple[str, float, flo
                 f"of {apron:g} m: choose a length with at least 1 m to spare"
             )
         length = min(room, scale.longest(name))
-        x0 = course.snap(apron + dice.uniform(0.0, room - length))
+        x0 = course.snap(apron + rng.uniform(0.0, room - length))
         return [(name, x0, course.snap(x0 + length))]
     # Lengths vary, their sum does not: all mixed terrains of a robot have the same size.
-    shares = dice.uniform(-0.4, 0.4, len(scale.mixed))
+    shares = rng.uniform(-0.4, 0.4, len(scale.mixed))
     lengths = [course.snap(scale.mixed_section + share) for share in shares - shares.mean()]
     lengths[-1] += course.snap(scale.mixed_section * len(lengths)) - sum(lengths)
     plan, x = [], apron
-    for kind, length in zip(dice.permutation(scale.mixed), lengths, strict=True):
+    for kind, length in zip(rng.permutation(scale.mixed), lengths, strict=True):
         plan.append((str(kind), course.snap(x), course.snap(x + length)))
         x += length + scale.mixed_landing
     return plan
@@ -227,7 +224,7 @@ def _plan(course: Course, name: str, apron: float) -> list[tuple[str, float, flo
 
 def _plan_between(course: Course, name: str) -> list[tuple[str, float, float]]:
     """Return where the obstacle lies, and where its neighbours before and after it."""
-    scale, dice = course.scale, course.dice
+    scale, rng = course.scale, course.rng
     others = [kind for kind in scale.mixed if kind != name]
     landing = course.snap(scale.mixed_landing)
     room = scale.length - 4 * landing  # a neighbour is at least as long as a landing
@@ -236,10 +233,10 @@ def _plan_between(course: Course, name: str) -> list[tuple[str, float, float]]:
             f"no neighbours for {name!r}: it must be one of {', '.join(scale.mixed)}, not the only "
             f"one, and a terrain of {scale.length:g} m must have 1 m besides 4 landings"
         )
-    length = course.snap(min(dice.uniform(0.75, 1.0) * room, scale.longest(name)))
-    x0 = course.snap(2 * landing + dice.uniform(0.0, room - length))
+    length = course.snap(min(rng.uniform(0.75, 1.0) * room, scale.longest(name)))
+    x0 = course.snap(2 * landing + rng.uniform(0.0, room - length))
     x1 = course.snap(x0 + length)
-    before, after = (str(kind) for kind in dice.choice(others, 2))
+    before, after = (str(kind) for kind in rng.choice(others, 2))
     return [
         (before, 0.0, course.snap(x0 - landing)),
         (name, x0, x1),
@@ -260,17 +257,16 @@ class World:
 
     tiles: Sequence[Sequence[Terrain]]
     """The terrains, [row][column]."""
-    margin: float = 1.5
+    margin: Annotated[float, Interval(ge=0, le=50)] = 1.5
     """Width of the margin around each terrain, m; rounded to whole cells."""
 
     def __post_init__(self) -> None:
+        check_fields(self, TerrainError)
         if not self.tiles or len({len(row) for row in self.tiles}) != 1 or not self.tiles[0]:
             raise TerrainError("a World needs rows of terrains, at least one, all equally long")
         kinds = {(tile.elevation.shape, tile.elevation.resolution) for tile in self._flat}
         if len(kinds) != 1:
             raise TerrainError(f"the terrains of a World must share shape and resolution: {kinds}")
-        if not self.margin >= 0:
-            raise TerrainError(f"margin must be 0 m or more, got {self.margin}")
 
     @property
     def _flat(self) -> list[Terrain]:

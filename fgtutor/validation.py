@@ -6,10 +6,13 @@ must be finite unless its field says otherwise (`Unbounded`). The types are anno
 """
 
 import inspect
+import io
 import json
 import re
+import sys
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr
 from dataclasses import fields, is_dataclass, make_dataclass
 from functools import cache
 from itertools import pairwise
@@ -101,6 +104,28 @@ def _check(kind: Callable[..., Any], values: Mapping[str, Any], error: type[Fgtu
             adapter.validate_python(_plain(values[name]))
         except ValidationError as problem:
             raise error(f"{name}: {_first(problem)}") from None
+
+
+def parse_options(kind: type[T], words: Sequence[str], program: str, default: T | None = None) -> T:
+    """Return the `kind` that a command line's words fill, from `default` if there is one.
+
+    Raises what `kind` itself does for a value that it refuses. Words that are no options, or no
+    numbers, end the program with a message, as `--help` does.
+    """
+    import tyro  # here, since most who check values read no command line
+
+    said = io.StringIO()
+    options: dict[str, Any] = {} if default is None else {"default": default}
+    try:
+        with redirect_stderr(said):
+            return tyro.cli(kind, args=words, prog=program, **options)
+    except SystemExit as stop:
+        cause: BaseException | None = stop
+        while cause := cause.__context__:  # tyro draws a box around what the dataclass raises
+            if isinstance(cause, FgtutorError):
+                raise cause from None
+        sys.stderr.write(said.getvalue())
+        raise
 
 
 def parse_record(

@@ -537,7 +537,9 @@ def test_pushes_move_a_standing_robot():
 
 
 def test_noise_stays_within_its_bounds_and_off_the_patch():
-    clean, noisy = (make(n=8, settings=A1EnvConfig(randomise=False, noise=on)) for on in (0, 1))
+    clean, noisy = (
+        make(n=8, settings=A1EnvConfig(randomise=False, noise=on)) for on in (False, True)
+    )
     for env in (clean, noisy):
         put(env, *[(0.8 + 0.9 * i, 2.0, 0.0) for i in range(8)])
     a, b = clean.get_observations(), noisy.get_observations()

@@ -60,18 +60,29 @@ def test_an_empty_zoo_is_broken(tmp_path, folder):
     assert finding.state == "broken" and str(tmp_path / folder) in finding.value
 
 
-@pytest.mark.parametrize(("name", "state"), [("pymunk", "broken"), ("jupyterlab", "note")])
-def test_a_missing_package_is_reported(zoo, monkeypatch, name, state):
+@pytest.mark.parametrize(
+    ("names", "what", "state"),
+    [
+        (("pymunk",), "pymunk", "broken"),
+        (("jupyterlab", "nbclient"), "extra lab", "note"),
+        (("ray",), "extra cluster", "note"),
+    ],
+)
+def test_what_is_not_installed_has_one_line_and_one_remedy(
+    zoo, monkeypatch, capsys, names, what, state
+):
     installed = importlib.metadata.version
 
     def version(package):
-        if package == name:
+        if package in names:
             raise importlib.metadata.PackageNotFoundError(package)
         return installed(package)
 
     monkeypatch.setattr(importlib.metadata, "version", version)
-    finding = findings(zoo)[name]
+    finding = findings(zoo)[what]
     assert finding.state == state and "pip install" in finding.fix
+    lines = doctor.report(list(findings(zoo).values())).splitlines()
+    assert len([line for line in lines if what in line]) == 2
 
 
 def test_a_torch_that_does_not_load_still_gets_a_report(zoo, monkeypatch):

@@ -1,6 +1,5 @@
 import dataclasses
 import errno
-import json
 import os
 import shutil
 import signal
@@ -14,6 +13,7 @@ import torch
 from fgtutor.errors import CheckpointError, ConfigError, StorageError
 from fgtutor.ppo import feasibility_labels
 from fgtutor.specialist import load_specialist
+from fgtutor.trainer import read_checkpoint, write_checkpoint
 from fgtutor.training import (
     A1TrainConfig,
     TrainConfig,
@@ -121,7 +121,7 @@ def run_in_subprocess(folder, resume, until=None):
     )
     checkpoint = folder / "checkpoint.pt"
     while until and process.poll() is None:
-        if checkpoint.exists() and torch.load(checkpoint)["iteration"] >= until:
+        if checkpoint.exists() and read_checkpoint(checkpoint)["iteration"] >= until:
             process.send_signal(signal.SIGKILL)
         time.sleep(0.01)
     return process.wait()
@@ -221,7 +221,7 @@ def test_from_a_run_its_critic_and_net_come_along_and_nothing_warms_up(trained, 
     shutil.rmtree(killed / "specialist")  # which a run writes when it ends
     settings = TINY | {"iterations": 3, "start_from": killed, "easiest": 0.5}
     trainer = Trainer(TrainConfig(out=tmp_path / "run", **settings))
-    critic = torch.load(config.folder / "checkpoint.pt")["algorithm"]["critic_state_dict"]
+    critic = read_checkpoint(config.folder / "checkpoint.pt")["algorithm"]["critic_state_dict"]
     policy, mine = trainer.algorithm.get_policy(), trainer.algorithm.critic.state_dict()
     assert critic and all(torch.equal(value, mine[name]) for name, value in critic.items())
     net, theirs = trainer.algorithm.feasibility.state_dict(), specialist.feasibility.state_dict()
@@ -301,25 +301,19 @@ def test_the_command_line_takes_the_robots_own_sizes(words, expected):
     assert config_of(words) is expected
 
 
-def test_a_checkpoint_older_than_a_setting_is_taken_up(trained, tmp_path):
-    config, specialist, _ = trained
-    state = torch.load(config.folder / "checkpoint.pt", weights_only=True)
-    settings = json.loads(state["config"])
-    young = ("actor", "context_learning_rate", "context_batch", "context_updates")
-    state["config"] = json.dumps({k: v for k, v in settings.items() if k not in young})
-    torch.save(state, tmp_path / "checkpoint.pt")
-    again = train(TrainConfig(out=tmp_path, resume=True, **TINY))
-    assert again.provenance["samples"] == specialist.provenance["samples"]
-    with pytest.raises(CheckpointError, match="actor was 'perceptive', now 'dreamwaq'"):
-        train(TrainConfig(out=tmp_path, resume=True, actor="dreamwaq", **TINY))
-
-
-def test_a_checkpoint_of_another_robot_is_refused(trained, tmp_path):
-    config, _, _ = trained
-    state = torch.load(config.folder / "checkpoint.pt", weights_only=True)
-    state["config"] = json.dumps(json.loads(state["config"]) | {"robot": "a1"})
-    torch.save(state, tmp_path / "checkpoint.pt")
-    with pytest.raises(CheckpointError, match="robot was 'a1', now 'toy'"):
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"robot": "a1"}, "robot was 'a1', now 'toy'"),
+        ({"iterations": 6}, r"does not hold what this version keeps \('algorithm'\)"),
+    ],
+)
+def test_a_checkpoint_that_is_whole_but_does_not_fit_is_refused(trained, tmp_path, change, message):
+    state = read_checkpoint(trained[0].folder / "checkpoint.pt")
+    del state["algorithm"]
+    state["config"] |= change
+    write_checkpoint(tmp_path / "checkpoint.pt", state)
+    with pytest.raises(CheckpointError, match=message):
         train(TrainConfig(out=tmp_path, resume=True, **TINY))
 
 
@@ -359,15 +353,46 @@ def test_ctrl_c_saves_and_returns_what_was_learned(tmp_path):
 
     specialist = train(TrainConfig(out=tmp_path, **TINY), on_iteration=interrupt)
     assert specialist.provenance["samples"] == 3 * 4 * 8
-    assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["iteration"] == 3
+    assert read_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == 3
     resumed = train(TrainConfig(out=tmp_path, resume=True, **TINY))
     assert resumed.provenance["samples"] == 6 * 4 * 8
 
 
-@pytest.mark.parametrize("name", ["iterations", "num_envs", "steps", "save_every", "rows"])
-def test_a_setting_below_one_is_refused(name):
-    with pytest.raises(ConfigError, match=name):
-        TrainConfig(**{name: 0})
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"iterations": 0}, "iterations: should be greater than or equal to 1, got 0"),
+        ({"seed": -1}, "seed: should be greater than or equal to 0, got -1"),
+        ({"learning_rate": float("nan")}, "learning_rate: should be a finite number, got nan"),
+        ({"learning_rate": -1.0}, "learning_rate: should be greater than 0"),
+        ({"gamma": 2.0}, "gamma: should be less than or equal to 1"),
+        ({"initial_std": -1.0}, "initial_std: should be greater than 0"),
+        ({"hidden": ()}, "hidden: .* at least 1 item"),
+        ({"hidden": (8, 0)}, "hidden: 1: should be greater than or equal to 1"),
+        ({"feasibility_batch": 0}, "feasibility_batch: "),
+        ({"label_seconds": float("inf")}, "label_seconds: should be a finite number"),
+        ({"planning_speed": 0.0}, "planning_speed: should be greater than 0"),
+        ({"threads": 100_000}, "threads: should be less than or equal to 256"),
+        ({"hours": float("nan")}, "hours: should be a finite number"),
+        ({"easiest": 1.5}, r"easiest: should be less than or equal to 1, got 1\.5"),
+        ({"neighbours": -0.1}, r"neighbours: .*got -0\.1"),
+        ({"easiest_at_last": 1.0}, "easiest_at_last: should be less than 1, got 1"),
+        ({"easiest_at_last": 0.5, "std_at_last": 0.0}, "std_at_last: should be greater than 0"),
+        ({"std_at_last": 0.1}, "std_at_last needs easiest_at_last"),
+        ({"num_envs": 1, "steps": 3}, "1 robots with 3 steps make no 4 mini-batches"),
+        ({"device": "tpu"}, "device should be cpu, cuda or cuda:NUMBER, got 'tpu'"),
+    ],
+)
+def test_a_setting_without_sense_is_refused(fields, message):
+    with pytest.raises(ConfigError, match=message):
+        TrainConfig(**fields)
+
+
+def test_a_device_that_is_not_there_is_named_with_those_that_are(tmp_path):
+    gpus = torch.cuda.device_count()
+    with pytest.raises(ConfigError, match=rf"no device cuda:{gpus} here: choose of cpu"):
+        train(TrainConfig(out=tmp_path / "run", device=f"cuda:{gpus}", **TINY))
+    assert not (tmp_path / "run" / "checkpoint.pt").exists()
 
 
 def test_a_rollout_too_short_for_its_label_is_refused():
@@ -388,10 +413,6 @@ def test_rows_rise_from_the_easiest_difficulty_to_the_whole():
         [0.75] * 2,
         [1.0] * 2,
     ]
-    with pytest.raises(ConfigError, match=r"easiest must be a difficulty from 0 to 1, got 1\.5"):
-        TrainConfig(easiest=1.5)
-    with pytest.raises(ConfigError, match=r"neighbours must be a share from 0 to 1, got -0\.1"):
-        TrainConfig(neighbours=-0.1)
 
 
 RISING = TINY | {"rows": 5, "easiest": 0.2, "easiest_at_last": 0.8, "std_at_last": 0.1}
@@ -439,20 +460,6 @@ def test_the_noise_falls_as_the_first_row_rises(tmp_path):
     trainer.easiest = 0.8
     trainer.iterate()
     assert noise.exp().max().item() <= 0.1 + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"easiest_at_last": 1.0}, "must be a difficulty below 1, got 1"),
-        ({"easiest_at_last": -0.5}, r"got -0\.5"),
-        ({"std_at_last": 0.1}, "needs easiest_at_last"),
-        ({"easiest_at_last": 0.5, "std_at_last": 0.0}, "must be above 0"),
-    ],
-)
-def test_a_first_row_that_cannot_rise_is_refused(fields, message):
-    with pytest.raises(ConfigError, match=message):
-        TrainConfig(**fields)
 
 
 def test_a_share_of_the_terrains_has_neighbours_where_there_can_be_any():

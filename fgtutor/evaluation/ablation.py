@@ -8,6 +8,7 @@ know of no policies, so the generalist drives them, or (+P) our policy map choos
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from typing import Annotated
 
 from fgtutor.baselines import planners
 from fgtutor.errors import ConfigError
@@ -15,6 +16,7 @@ from fgtutor.evaluation import success
 from fgtutor.evaluation.report import Share, markdown
 from fgtutor.evaluation.runner import Row
 from fgtutor.evaluation.success import TrialsConfig, by_cell, summarise
+from fgtutor.validation import Unique
 
 COMMAND = "evaluate baselines"
 
@@ -25,7 +27,7 @@ class AblationConfig(TrialsConfig):
 
     terrain: str = "mixed"
     """The terrain to cross."""
-    planners: tuple[str, ...] = ()
+    planners: Annotated[tuple[str, ...], Unique] = ()
     """Only these planners; default: all."""
 
 

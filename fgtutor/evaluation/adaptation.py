@@ -15,12 +15,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from jaxtyping import Float
 from torch import Tensor
 
-from fgtutor.errors import ConfigError, PlanningError, TerrainError
+from fgtutor.errors import PlanningError, TerrainError
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.mapchart import draw_maps
 from fgtutor.evaluation.metrics import spl
@@ -37,6 +39,8 @@ from fgtutor.routes import Route
 from fgtutor.specialist import ZOO, Specialist
 from fgtutor.tensorization import tensorize
 from fgtutor.terrain import Section, Terrain, rasterise
+from fgtutor.validation import Count
+from fgtutor.validation import Share as Fraction
 
 COMMAND = "evaluate adaptation"
 CHECKPOINTS = "_checkpoints"
@@ -55,29 +59,24 @@ TREADS = 3
 """Treads of a gate's flight: two steps up, two down."""
 RESAMPLES = 2000
 """Resamples of a bootstrap interval."""
+Riser = Annotated[float, Interval(ge=0, le=1.5)]
+"""A riser as a share of the robot's highest one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptationConfig(PlannedConfig):
     """Plan with early, mid and late checkpoints of one policy, the paper's Table I."""
 
-    trials: int = 100
+    trials: Count = 100
     """Trials per checkpoint."""
-    maps: int = 20
+    maps: Annotated[int, Interval(ge=1, le=100_000)] = 20
     """Maps that the trials are spread over; their steps differ a little."""
-    heights: tuple[float, float, float] = (0.87, 0.67, 0.2)
+    heights: tuple[Riser, Riser, Riser] = (0.87, 0.67, 0.2)
     """Risers of the short, the middle and the long way, as shares of the robot's highest one."""
-    f_min: float = 0.45
+    f_min: Fraction = 0.45
     """Edges less feasible than this do not exist; a robot that may go around can be choosy."""
     zoo: Path | None = None
     """Folder of checkpoints, a specialist folder each; default: those of the shipped steps."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.maps < 1 or self.trials < 1:
-            raise ConfigError(f"need trials and maps >= 1, got {self.trials} and {self.maps}")
-        if not all(0 <= share <= 1.5 for share in self.heights):
-            raise ConfigError(f"heights must be shares from 0 to 1.5, got {self.heights}")
 
     @property
     def home(self) -> Path:
@@ -138,8 +137,8 @@ def _lay_flight(
     course: Course, x: tuple[float, float], y: tuple[float, float], highest: float
 ) -> None:
     """Lay two steps up and two down between x[0] and x[1]."""
-    first, second = highest * course.dice.uniform(0.9, 1.0, 2)
-    shares = np.cumsum(course.dice.uniform(0.9, 1.1, TREADS))
+    first, second = highest * course.rng.uniform(0.9, 1.0, 2)
+    shares = np.cumsum(course.rng.uniform(0.9, 1.1, TREADS))
     borders = [x[0], *(course.snap(x[0] + (x[1] - x[0]) * share / shares[-1]) for share in shares)]
     for near, far, top in zip(borders, borders[1:], (first, first + second, second), strict=False):
         course.block(near, far, *y, float(top))

@@ -9,10 +9,11 @@ Source: paper, Sec. III-A (feasibility is predicted r_v) and Eq. 4.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
@@ -26,6 +27,7 @@ from fgtutor.specialist import Specialist, load_zoo
 from fgtutor.storage import check_writable, write_json
 from fgtutor.tensorization import resolve_taus
 from fgtutor.terrain import World, make_terrain
+from fgtutor.validation import NonNegative, Seed, check_fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,15 +36,15 @@ class CalibrationConfig:
 
     robot: str = "toy"
     """Which robot."""
-    envs: int = 100
+    envs: Annotated[int, Interval(ge=1, le=10_000)] = 100
     """Robots, each on a terrain of its own."""
-    seconds: float = 16.0
+    seconds: Annotated[float, Interval(gt=0, le=3600)] = 16.0
     """How long they drive, s; ended episodes begin anew."""
-    seed: int = 0
+    seed: Seed = 0
     """What terrains and episodes are drawn from."""
     taus: Literal["paper", "calibrated"] = "calibrated"
     """Thresholds of w_ood."""
-    relief: float = 0.06
+    relief: NonNegative = 0.06
     """A patch with at least this difference of heights is distinctive of its terrain, m."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped zoo."""
@@ -50,8 +52,7 @@ class CalibrationConfig:
     """Write the results here."""
 
     def __post_init__(self) -> None:
-        if self.envs < 1 or not self.seconds > 0:
-            raise ConfigError(f"need envs >= 1 and seconds > 0, got {self.envs}, {self.seconds}")
+        check_fields(self)
 
 
 @dataclass(frozen=True, eq=False)

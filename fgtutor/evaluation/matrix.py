@@ -7,6 +7,7 @@ with 250 trials each, 300,000 trials with four specialists.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 from fgtutor.baselines import OURS
 from fgtutor.errors import ConfigError
@@ -16,6 +17,7 @@ from fgtutor.evaluation.runner import Row
 from fgtutor.evaluation.success import TrialsConfig, by_cell
 from fgtutor.specialist import GENERAL, Specialist
 from fgtutor.terrain import SCALES
+from fgtutor.validation import Unique
 
 COMMAND = "evaluate matrix"
 
@@ -24,9 +26,9 @@ COMMAND = "evaluate matrix"
 class MatrixConfig(TrialsConfig):
     """Evaluate policies x terrains, the paper's Table II."""
 
-    terrains: tuple[str, ...] = ()
+    terrains: Annotated[tuple[str, ...], Unique] = ()
     """Only these terrains; default: the robot's own and mixed."""
-    policies: tuple[str, ...] = ()
+    policies: Annotated[tuple[str, ...], Unique] = ()
     """Only these policies; default: each specialist, ours, general."""
 
 

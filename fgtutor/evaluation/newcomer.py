@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated
 
 from fgtutor.baselines import Layers, View, ours
 from fgtutor.errors import ConfigError, EvaluationError
@@ -23,6 +24,7 @@ from fgtutor.evaluation.success import TrialsConfig, by_cell, make_ground, summa
 from fgtutor.evaluation.trials import drive
 from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist, load_zoo
 from fgtutor.terrain import SCALES
+from fgtutor.validation import Unique
 
 COMMAND = "evaluate newcomer"
 STAGES = ("without", "with")
@@ -38,7 +40,7 @@ class NewcomerConfig(TrialsConfig):
     in the zoo, to add."""
     terrain: str | None = None
     """The terrain that it is for; default: the one that it was trained on."""
-    others: tuple[str, ...] = ()
+    others: Annotated[tuple[str, ...], Unique] = ()
     """Terrains that must not suffer; default: the robot's own and mixed."""
 
     @property

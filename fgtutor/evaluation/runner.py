@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from fgtutor.errors import ConfigError, EvaluationError, FgtutorError, MissingExtraError
 from fgtutor.evaluation.provenance import machine
+from fgtutor.machine import usable_cores
 
 Row = dict[str, Any]
 """One trial, as JSON keeps it."""
@@ -87,7 +88,7 @@ def run_tasks(
     if ray is not None:
         yield from _on_ray(tasks, ray)
         return
-    workers = min(workers or os.cpu_count() or 1, len(tasks))
+    workers = min(workers or usable_cores(), len(tasks))
     if workers > 1:
         yield from _on_processes(tasks, workers)
         return
@@ -151,7 +152,8 @@ class _Worker:
         self.line, theirs = context.Pipe()
         # A daemon is stopped when this process ends; if it is killed, the worker sees to that.
         self.process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        self.process.start()
+        with _safe_path():
+            self.process.start()
         theirs.close()  # or the end of the worker would not be the end of the line
         self.task: Task | None = None
 
@@ -168,6 +170,22 @@ class _Worker:
             self.process.join(timeout=5.0)
         self.process.terminate()
         self.process.join()
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Let a Python started in the block take no module from the current folder.
+
+    multiprocessing starts its own with `-c`, which would look there first, even for Python's own.
+    """
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        del os.environ["PYTHONSAFEPATH"]
+        if before is not None:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 def _serve(line: connection.Connection) -> None:

@@ -9,7 +9,6 @@ a worker that is killed in it costs the time since the last checkpoint, and not 
 import contextlib
 import io
 import math
-import os
 import re
 import threading
 from collections.abc import Iterator, Sequence
@@ -18,10 +17,10 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-import tyro
+from annotated_types import Interval, MinLen
 from tqdm import tqdm
 
 from fgtutor import training
@@ -38,13 +37,15 @@ from fgtutor.evaluation.runner import Row, Task
 from fgtutor.evaluation.shards import RunConfig, part_of, settings_of
 from fgtutor.evaluation.success import TrialsConfig, by_cell, cut, make_ground
 from fgtutor.evaluation.trials import drive
+from fgtutor.machine import usable_cores
 from fgtutor.recipe import A1TrainConfig, TrainConfig, comparable, training_world
 from fgtutor.recipe import config_of as recipe_of
 from fgtutor.robots import env_class
 from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist
 from fgtutor.storage import make_folder
 from fgtutor.terrain import SCALES
-from fgtutor.training import CHECKPOINT, Trainer, give_back_memory
+from fgtutor.trainer import CHECKPOINT, Trainer, give_back_memory
+from fgtutor.validation import Seed, Unique, parse_options
 
 COMMAND = "sweep"
 RUNS = "runs"
@@ -72,14 +73,14 @@ class SweepConfig(RunConfig):
     none."""
     robot: str = "toy"
     """Which robot."""
-    terrains: tuple[str, ...] = ()
+    terrains: Annotated[tuple[str, ...], Unique] = ()
     """Terrains to specialise in; default: the robot's own."""
-    seeds: tuple[int, ...] = (1, 2, 3)
+    seeds: Annotated[tuple[Seed, ...], MinLen(1), Unique] = (1, 2, 3)
     """Seeds of the trainings."""
     vary: tuple[str, ...] = ()
     """One more thing to vary: an option of `fgtutor train` and its values, as in `learning-rate
     1e-3 3e-4`."""
-    trials: int = 50
+    trials: Annotated[int, Interval(ge=1, le=100_000)] = 50
     """Held-out terrains of full difficulty that each specialist then crosses."""
     train: TrainConfig = field(default_factory=TrainConfig)
     """What all trainings share, as for `fgtutor train`."""
@@ -88,8 +89,6 @@ class SweepConfig(RunConfig):
         super().__post_init__()
         if self.out is None:
             raise ConfigError("trainings keep their checkpoints in a folder: give --out FOLDER")
-        if self.trials < 1 or not self.seeds:
-            raise ConfigError(f"need trials >= 1 and a seed, got {self.trials} and {self.seeds}")
         untouched = type(self.train)()
         for name in OURS_TO_SET:
             given = getattr(self.train, name)
@@ -174,7 +173,7 @@ def _with(config: TrainConfig, option: str, value: str) -> TrainConfig:
     words, said = [f"--{option}", *value.split()], io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(type(config), args=words, default=config, console_outputs=False)
+            return parse_options(type(config), words, "fgtutor train", config)
     except SystemExit as error:
         lines = (line.strip("│ ") for line in said.getvalue().splitlines() if "│" in line)
         why = next(lines, "there is no such option")
@@ -314,7 +313,7 @@ def run(config: SweepConfig) -> int:
     """Train from the command line, print the table and write the report."""
     option = config.vary[0] if config.vary else ""
     # A training's own threads are cores that no other one has.
-    workers = config.workers or max(1, (os.cpu_count() or 1) // config.train.threads)
+    workers = config.workers or max(1, usable_cores() // config.train.threads)
     title = f"Trainings side by side ({config.robot})"
     iterations = "" if option == "iterations" else f", {config.train.iterations} iterations"
 

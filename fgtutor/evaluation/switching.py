@@ -15,9 +15,10 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
+from annotated_types import Interval, MinLen
 
 from fgtutor.baselines import OURS, Planner, View, find_route, ours, single
 from fgtutor.elevation import ElevationMap
@@ -36,8 +37,14 @@ from fgtutor.routes import Route
 from fgtutor.scanning import ScanConfig, map_points
 from fgtutor.specialist import GENERAL, Specialist
 from fgtutor.terrain import Section, Terrain, rasterise
+from fgtutor.validation import Count, Positive, Unique
+from fgtutor.validation import Share as Fraction
 
 T = TypeVar("T")
+Error = Annotated[float, Interval(ge=0, le=10)]
+"""How far off a fix is, m, or drifts, m per square root of a second."""
+Levels = Annotated[tuple[tuple[Error, Error], ...], MinLen(1), Unique]
+"""Pairs of both."""
 
 COMMAND = "evaluate switching"
 ORDERS = {
@@ -56,37 +63,25 @@ change only for a step that the old and the new one can both take."""
 class SwitchingConfig(PlannedConfig):
     """Drive from terrain to terrain on scanned maps, the paper's Table III."""
 
-    trials: int = 50
+    trials: Count = 50
     """Trials per course, planner and level of noise, each on a ground of its own. With more of
     them in the same folder, only the new ones are driven."""
-    levels: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.03, 0.0), (0.03, 0.01), (0.06, 0.02))
+    levels: Levels = ((0.0, 0.0), (0.03, 0.0), (0.03, 0.01), (0.06, 0.02))
     """Localisation errors: standard deviation of each fix, m, and its drift, m per square root of a
     second."""
-    courses: tuple[str, ...] = ()
+    courses: Annotated[tuple[str, ...], Unique] = ()
     """Only these courses, such as steps-gaps; default: every pair of neighbours, and full."""
-    planners: tuple[str, ...] = ()
+    planners: Annotated[tuple[str, ...], Unique] = ()
     """Only these planners; default: all."""
-    switch_cost: float = 1.0
+    switch_cost: Positive = 1.0
     """Cost of a change of policy for the planners that heed it, in the unit of `cost` (metres or
     steps where F is 1)."""
-    hold_steps: int = FollowConfig.hold_steps
+    hold_steps: Annotated[int, Interval(ge=1, le=100_000)] = FollowConfig.hold_steps
     """Control steps for which another policy must be wanted, for the planners with hysteresis."""
-    difficulty: float = 1.0
+    difficulty: Fraction = 1.0
     """Difficulty of all terrains."""
-    scan_spacing: float = 0.2
+    scan_spacing: Annotated[float, Interval(ge=0.01, le=100)] = 0.2
     """Distance between two poses of the scanner, m."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.trials < 1 or self.hold_steps < 1 or not self.switch_cost > 0:
-            raise ConfigError(
-                "need trials and hold_steps >= 1 and a switch_cost > 0, got "
-                f"{self.trials}, {self.hold_steps} and {self.switch_cost}"
-            )
-        if not self.levels or not all(np.isfinite(x) and x >= 0 for x in np.ravel(self.levels)):
-            raise ConfigError(f"levels must be pairs of numbers >= 0, got {self.levels}")
-        if not self.scan_spacing > 0:
-            raise ConfigError(f"need a scan_spacing above 0 m, got {self.scan_spacing}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,9 +252,8 @@ def _drive(
     driven = {}
     if planned:
         way, where = zip(*planned, strict=True)
-        team = {name: zoo[name] for name in way[0].names}
         seeds = [ground.seed for ground in where]
-        episodes = execute_batch(way, where, team, seeds=seeds, config=follow)
+        episodes = execute_batch(way, where, zoo, seeds=seeds, config=follow)
         driven = dict(zip(seeds, episodes, strict=True))
     rows = []
     for route, ground in zip(routes, grounds, strict=True):

@@ -4,13 +4,21 @@ Reads `A1EnvConfig`; writes masses, frictions and gains into the simulations of 
 """
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from jaxtyping import Bool
 from torch import Tensor
 
 from fgtutor.robots.a1_terms import RewardWeights
 from fgtutor.robots.physics import Physics
+from fgtutor.validation import Ascending, Share, check_fields
+
+Friction = Annotated[float, Interval(gt=0, le=5)]
+"""A coefficient of friction."""
+Load = Annotated[float, Interval(ge=-4, le=50)]
+"""Mass added to the trunk, which weighs 4.7 kg itself, kg."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,39 +29,42 @@ class A1EnvConfig:
     """Make every robot a little different, delay some and push all of them, by the ranges below."""
     noise: bool = True
     """Add sensor noise to what the policy observes."""
-    action_scale: float = 0.5
+    action_scale: Annotated[float, Interval(gt=0, le=10)] = 0.5
     """Change of a joint's target that an action of 1 asks for, rad."""
-    substeps: int = 4
+    substeps: Annotated[int, Interval(ge=1, le=100)] = 4
     """Simulation steps per control step: 50 Hz control."""
-    gait_frequency: float = 2.0
+    gait_frequency: Annotated[float, Interval(gt=0, le=20)] = 2.0
     """Gait cycles per second."""
-    swing_height: tuple[float, float] = (0.04, 0.1)
+    swing_height: Annotated[tuple[Share, Share], Ascending] = (0.04, 0.1)
     """Lowest and highest clearance of a good swing, m."""
     weights: RewardWeights = field(default_factory=RewardWeights)
     """Weight of each reward term."""
-    friction: tuple[float, float] = (0.5, 1.1)
+    friction: Annotated[tuple[Friction, Friction], Ascending] = (0.5, 1.1)
     """Range of the friction coefficient."""
-    payload: tuple[float, float] = (-0.5, 1.5)
+    payload: Annotated[tuple[Load, Load], Ascending] = (-0.5, 1.5)
     """Range of the mass added to the trunk, kg."""
-    centre_shift: float = 0.03
+    centre_shift: Share = 0.03
     """Largest shift of the trunk's centre of mass along each axis, m."""
-    gain_share: float = 0.1
+    gain_share: Annotated[float, Interval(ge=0, lt=1)] = 0.1
     """Largest relative change of the joint controllers' stiffness and damping."""
-    delayed_share: float = 0.5
+    delayed_share: Share = 0.5
     """Share of robots whose actions take effect one control step late."""
-    push_speed: float = 0.4
+    push_speed: Annotated[float, Interval(ge=0, le=20)] = 0.4
     """Largest change of the trunk's velocity by a push, along x and y, m/s."""
-    push_seconds: float = 8.0
+    push_seconds: Annotated[float, Interval(gt=0, le=3600)] = 8.0
     """Mean time between two pushes, s."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bool[Tensor, "sims 1"]:
     """Make every simulation another robot on another ground; return which robots act late."""
     s, n = settings, physics.num_sims
-    dice = torch.Generator().manual_seed(seed)
+    rng = torch.Generator().manual_seed(seed)
 
     def draw(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(n, *shape, generator=dice, dtype=torch.float64)
+        return low + (high - low) * torch.rand(n, *shape, generator=rng, dtype=torch.float64)
 
     trunk, own = physics.model.body("trunk"), physics.model
     physics.parameter("opt.o_friction")[:, :2] = draw(*s.friction, 1)

@@ -8,17 +8,24 @@ unitreerobotics/unitree_ros on GitHub ("URDF" below), where no other source is n
 # MuJoCo's compiled modules carry no type information that pyright could read.
 # pyright: reportAttributeAccessIssue=false
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Annotated
 
 import mujoco
 import numpy as np
+from annotated_types import Interval
 from jaxtyping import Float
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.terrain import Box
+from fgtutor.validation import check_fields
+
+Gain = Annotated[float, Interval(gt=0, le=1000)]
+"""A stiffness or a torque."""
+Damping = Annotated[float, Interval(ge=0, le=100)]
+"""A damping or an inertia."""
 
 LEGS = ("FR", "FL", "RR", "RL")
 """Legs in the order of every array (F front, R rear; R right, L left), as in Unitree's SDK."""
@@ -96,34 +103,29 @@ FOOT = Inertia(0.06, (0.0, 0.0, -CALF_LENGTH), (9.6e-06, 9.6e-06, 9.6e-06, 0.0, 
 class A1Config:
     """What can be chosen about the A1 and its simulation; the rest is the robot itself."""
 
-    kp: float = 35.0
+    kp: Gain = 35.0
     """Stiffness of the joint controllers, N m / rad (28 to 40 are usual in published A1 work)."""
-    kd: float = 0.5
+    kd: Damping = 0.5
     """Damping of the joint controllers, N m s / rad."""
-    torque_limit: float = 33.5
+    torque_limit: Gain = 33.5
     """Highest joint torque, N m (URDF)."""
-    armature: float = 0.01
+    armature: Damping = 0.01
     """Rotor inertia seen at abduction and hip joints, kg m^2 (mujoco_menagerie's A1)."""
-    knee_armature: float = 0.02
+    knee_armature: Damping = 0.02
     """Rotor inertia seen at the knee, behind its additional linkage, kg m^2."""
-    damping: float = 0.01
+    damping: Damping = 0.01
     """Passive joint damping, N m s / rad (URDF). Its dry friction of 0.2 N m is left out: it would
     add 12 rows to every contact problem for less than 1 % of the torque limit."""
-    friction: float = 0.8
+    friction: Annotated[float, Interval(gt=0, le=5)] = 0.8
     """Sliding friction on any terrain (mujoco_menagerie's A1 foot). To randomise it, write
     `physics.parameter("opt.o_friction")[:, :2]`."""
-    timestep: float = 0.005
+    timestep: Annotated[float, Interval(ge=1e-4, le=0.05)] = 0.005
     """One simulation step, s; four make one control step at 50 Hz."""
-    iterations: int = 5
+    iterations: Annotated[int, Interval(ge=1, le=1000)] = 5
     """Newton iterations at most; more change nothing visible, and a GPU back end needs few."""
 
     def __post_init__(self) -> None:
-        positive = (self.kp, self.torque_limit, self.friction, self.timestep, self.iterations)
-        if not all(math.isfinite(v) and v > 0 for v in positive):
-            raise ConfigError(
-                "A1Config needs kp, torque_limit, friction, timestep and iterations above 0, "
-                f"got {self}"
-            )
+        check_fields(self)
 
 
 SENSORS = {

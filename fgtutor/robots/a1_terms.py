@@ -8,14 +8,17 @@ or they would teach nonsense on slopes.
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from jaxtyping import Float
 from torch import Tensor
 
 from fgtutor.patches import PatchGrid
 from fgtutor.robots.a1_model import JOINT_RANGES, LINKS, MIRROR, MIRROR_SIGNS
 from fgtutor.symmetry import Mirror, join
+from fgtutor.validation import check_fields
 
 # Observations -------------------------------------------------------------------------------------
 
@@ -79,6 +82,10 @@ SOFT_LIMIT = 0.95
 """Share of a joint's range in which it may move freely."""
 
 
+Weight = Annotated[float, Interval(ge=-1000, le=1000)]
+"""What a term of the reward counts."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RewardWeights:
     """Weight of each term, per second; the sum is floored at zero.
@@ -87,28 +94,31 @@ class RewardWeights:
     a hard place is worth little: hesitation, not falling, is what robots learn otherwise.
     """
 
-    tracking: float = 1.2
+    tracking: Weight = 1.2
     """Narrow kernel of the planar velocity error."""
-    approach: float = 0.6
+    approach: Weight = 0.6
     """Wide kernel of the same error: a slope to climb from afar."""
-    turning: float = 0.5
+    turning: Weight = 0.5
     """Kernel of the turn rate error, when moving."""
-    gait: float = 1.5
+    gait: Weight = 1.5
     """Stepping with the clock, when moving."""
-    posture: float = 0.5
+    posture: Weight = 0.5
     """Joints near the stance, feet close together, when moving."""
-    orientation: float = -2.0
+    orientation: Weight = -2.0
     """Squared sine of the trunk's tilt."""
-    bounce: float = -0.5
+    bounce: Weight = -0.5
     """Squared vertical velocity."""
-    wobble: float = -0.02
+    wobble: Weight = -0.02
     """Squared roll and pitch rate."""
-    limits: float = -1.0
+    limits: Weight = -1.0
     """Joint angles beyond the soft limits, rad."""
-    jerk: float = -0.02
+    jerk: Weight = -0.02
     """Squared change of the action."""
-    landing: float = -0.3
+    landing: Weight = -0.3
     """Foot forces beyond what a step needs."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def kernel(error: Float[Tensor, "*n"], width: float) -> Float[Tensor, "*n"]:

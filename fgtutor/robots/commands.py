@@ -6,11 +6,20 @@ episodes are drawn, and by execution, where a route is followed. Source: paper, 
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Interval
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor
 
+from fgtutor.validation import Ascending, NonNegative, Share, Unbounded, check_fields
+
+Speed = Annotated[float, Interval(ge=0, le=20)]
+"""A speed, m/s."""
+Time = Annotated[float, Interval(gt=0, le=3600)]
+"""A part of an episode, s."""
 SIGMA = 0.25
 """Scale of the tracking reward, m/s (paper, Eq. 1)."""
 
@@ -30,43 +39,46 @@ def tracking_reward(
 class EnvConfig:
     """How episodes are drawn and ended; the robot's own numbers live beside the robot."""
 
-    speed: tuple[float, float] = (0.7, 1.0)
+    speed: Annotated[tuple[Speed, Speed], Ascending] = (0.7, 1.0)
     """Range of the commanded forward speed, m/s."""
-    max_turn_rate: float = 1.5
+    max_turn_rate: Annotated[float, Interval(gt=0, le=20)] = 1.5
     """Limit of the commanded turn rate, rad/s."""
-    episode_seconds: float = 8.0
+    episode_seconds: Time = 8.0
     """Time limit of an episode, s."""
-    stuck_seconds: float = 2.0
+    stuck_seconds: Unbounded = 2.0
     """An episode without `stuck_progress` for this long has failed, s; waiting must not pay."""
-    stuck_progress: float = 0.05
+    stuck_progress: NonNegative = 0.05
     """Progress that counts as moving, m."""
-    stray: float = 1.0
+    stray: Unbounded = 1.0
     """In training a robot this far beside its line has failed, m, and so has one that heads more
     than 45 degrees off the heading that it was told."""
-    slowest: float = 1.0
+    slowest: Share = 1.0
     """Least share of its speed at which a robot turns; 1: it never slows down to turn."""
-    obedience: float = 1.0
+    obedience: Annotated[float, Interval(gt=0, le=1)] = 1.0
     """Share of the greatest turn rate at which a robot is expected to follow a new heading."""
-    start_yaw: float = 0.15
+    start_yaw: Annotated[float, Interval(ge=0, le=math.pi)] = 0.15
     """Greatest angle at which a crossing comes to its lane, rad; routes do at 45 or 90 degrees."""
-    start_beside: float = 0.3
+    start_beside: NonNegative = 0.3
     """Greatest distance beside the corridor over the obstacle at which a crossing begins, m."""
-    run_up: float = math.inf
+    run_up: Annotated[float, Ge(0), Field(allow_inf_nan=True)] = math.inf
     """Least distance before the obstacle at which a crossing begins, m, since a route may bend as
     late; infinite: all begin at the tile's end."""
-    traverse_share: float = 0.6
+    traverse_share: Share = 0.6
     """Share of episodes that start before the obstacle and cross it; others start anywhere."""
-    turn_share: float = 0.25
+    turn_share: Share = 0.25
     """Share of episodes whose heading changes on the way, as a route's does."""
-    promote_above: float = 0.5
+    promote_above: Share = 0.5
     """Mean r_v of an unfailed episode from which its robot moves to a harder row."""
-    demote_below: float = 0.3
+    demote_below: Share = 0.3
     """Mean r_v of a crossing below which its robot moves to an easier row; so does a failure in the
     tile's first half."""
     train: bool = True
     """Draw new episodes when one ends; False leaves finished robots where they are."""
-    history: int = 0
+    history: Annotated[int, Interval(ge=0, le=100)] = 0
     """Frames that a blind policy remembers; with any, there are groups `history` and `critic`."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def bearing(beside: Float[Tensor, "envs"]) -> Float[Tensor, "envs"]:

@@ -11,10 +11,11 @@ and its specifications, "Livox" below.
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import mujoco
 import numpy as np
+from annotated_types import Interval
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +23,14 @@ from fgtutor.cloudfiles import Points
 from fgtutor.errors import CloudError, ConfigError
 from fgtutor.robots.a1_model import STANCE, STANCE_HEIGHT, add_box, build_spec
 from fgtutor.terrain import Terrain, boxes_from_elevation
+from fgtutor.validation import Ascending, NonNegative, Positive, check_fields
 
+MOST_RAYS = 10_000_000
+"""Rays from one pose; each takes some 100 bytes."""
+Latitude = Annotated[float, Interval(ge=-90, le=90)]
+"""An angle against the horizontal, degrees."""
+Noise = Annotated[float, Interval(ge=0, le=100)]
+"""A standard deviation, m or degrees."""
 Poses = Float[np.ndarray, "poses 6"]
 
 SPIN, SWEEP = 397.21, 7.0711
@@ -37,41 +45,35 @@ down, so that its 52 degrees look at the ground. Our choice; the paper does not 
 class LidarConfig:
     """What the sensor measures, how well, and who carries it."""
 
-    point_rate: float = 200_000.0
+    point_rate: Annotated[float, Interval(gt=0, le=1e8)] = 200_000.0
     """Rays a second (Livox)."""
-    seconds: float = 0.1
+    seconds: Annotated[float, Interval(gt=0, le=3600)] = 0.1
     """How long the sensor looks from each pose, s; Livox's usual frame."""
-    elevation: tuple[float, float] = (-7.0, 52.0)
+    elevation: Annotated[tuple[Latitude, Latitude], Ascending] = (-7.0, 52.0)
     """Lowest and highest ray against the sensor's own horizon, degrees (Livox); all around it."""
-    reach: tuple[float, float] = (0.1, 40.0)
+    reach: Annotated[tuple[NonNegative, Positive], Ascending] = (0.1, 40.0)
     """Nearest and farthest echo, m (Livox; at 10 % reflectivity)."""
-    range_noise: float = 0.02
+    range_noise: Noise = 0.02
     """Standard deviation of a distance, m (Livox; at 10 m)."""
-    angle_noise: float = 0.15
+    angle_noise: Noise = 0.15
     """Standard deviation of a ray's direction, degrees (Livox)."""
-    position_noise: float = 0.01
+    position_noise: Noise = 0.01
     """Standard deviation of the error of each pose's position, m, as localisation leaves it."""
-    attitude_noise: float = 0.2
+    attitude_noise: Noise = 0.2
     """Standard deviation of the error of each pose's roll, pitch and yaw, degrees."""
     carrier: Literal["none", "a1"] = "none"
     """Whether an A1 in its stance hangs on the sensor: it shades what is behind it, and the points
     on itself are removed."""
 
     def __post_init__(self) -> None:
-        low, high = self.elevation
-        noise = (self.range_noise, self.angle_noise, self.position_noise, self.attitude_noise)
-        if not (self.point_rate > 0 and self.seconds > 0 and self.rays >= 1):
+        check_fields(self)
+        if not 1 <= self.rays <= MOST_RAYS:
             raise ConfigError(
-                "need a point_rate and seconds that make at least one ray a pose, got "
-                f"{self.point_rate} and {self.seconds}"
+                f"a point_rate and seconds of {self.point_rate:g} and {self.seconds:g} make "
+                f"{self.rays} rays from each pose: choose them so that there are 1 to {MOST_RAYS}"
             )
-        if not (-90 <= low < high <= 90 and 0 <= self.reach[0] < self.reach[1]):
-            raise ConfigError(
-                "need elevation within -90..90 degrees and reach from 0 m, each lowest first, got "
-                f"{self.elevation} and {self.reach}"
-            )
-        if not all(math.isfinite(value) and value >= 0 for value in noise):
-            raise ConfigError(f"noise must be 0 or more and finite, got {noise}")
+        if self.elevation[0] == self.elevation[1] or self.reach[0] == self.reach[1]:
+            raise ConfigError("the two ends of elevation and of reach should differ")
 
     @property
     def rays(self) -> int:
@@ -145,19 +147,19 @@ def scan_terrain(
     config = config or LidarConfig()
     poses = _checked(survey(terrain) if poses is None else poses, terrain)
     scene = _Scene(terrain, config)
-    dice = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     clouds = []
     for i, pose in enumerate(poses):
         rays = pattern((i + np.arange(config.rays) / config.rays) * config.seconds, config)
         true = Rotation.from_euler("xyz", pose[3:])
         # The mirror points a little beside where it says; to first order any small vector serves.
-        jitter = math.radians(config.angle_noise) * dice.standard_normal(rays.shape)
+        jitter = math.radians(config.angle_noise) * rng.standard_normal(rays.shape)
         cast = rays + jitter
         cast /= np.linalg.norm(cast, axis=1, keepdims=True)
         distance, own = scene.cast(pose, true.apply(cast))
-        distance += config.range_noise * dice.standard_normal(len(distance))
-        tilt = Rotation.from_rotvec(math.radians(config.attitude_noise) * dice.standard_normal(3))
-        place = pose[:3] + config.position_noise * dice.standard_normal(3)
+        distance += config.range_noise * rng.standard_normal(len(distance))
+        tilt = Rotation.from_rotvec(math.radians(config.attitude_noise) * rng.standard_normal(3))
+        place = pose[:3] + config.position_noise * rng.standard_normal(3)
         echo = ~own & (distance >= config.reach[0]) & (distance <= config.reach[1])
         clouds.append(place + (tilt * true).apply(distance[echo, None] * rays[echo]))
     points = np.concatenate(clouds)

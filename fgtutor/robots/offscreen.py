@@ -154,7 +154,10 @@ class Renderer:
         height, width, _ = self.shape
         with self._path("log.txt").open("wb") as log:
             return subprocess.Popen(
-                [sys.executable, "-m", __name__, self._path("model.mjb"), str(width), str(height)],
+                [
+                    *(sys.executable, "-P", "-m", __name__),  # -P: no module of the current folder
+                    *(self._path("model.mjb"), str(width), str(height)),
+                ],
                 env={**environment, "MUJOCO_GL": self.backend},
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,

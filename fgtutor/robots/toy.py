@@ -12,11 +12,13 @@ Yaw is kinematic: the turn rate is the command's, the wheels do not have to earn
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import pymunk
 import pymunk.batch
 import torch
+from annotated_types import Interval
 from jaxtyping import Bool, Float, Int
 from pymunk.constraints import DampedSpring, GrooveJoint, SimpleMotor
 from torch import Tensor
@@ -25,6 +27,7 @@ from fgtutor.patches import PatchGrid, sample_heights
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.robots.commands import EnvConfig
 from fgtutor.terrain import World
+from fgtutor.validation import Ascending, NonNegative, Positive, check_fields
 
 LANE = 1000.0
 """Vertical distance between the lanes of two robots, m: far beyond anything they can reach."""
@@ -50,38 +53,41 @@ HOLE = 0.45
 class ToyModel:
     """The toy's body. Sizes are near the A1's, so that both robots share maps of one scale."""
 
-    chassis_mass: float = 8.0
+    chassis_mass: Positive = 8.0
     """kg"""
-    chassis_size: tuple[float, float] = (0.56, 0.10)
+    chassis_size: tuple[Positive, Positive] = (0.56, 0.10)
     """Length and height, m."""
-    wheel_mass: float = 1.0
+    wheel_mass: Positive = 1.0
     """kg, each"""
-    wheel_radius: float = 0.09
+    wheel_radius: Positive = 0.09
     """m"""
-    half_base: float = 0.25
+    half_base: Positive = 0.25
     """Half the distance between the axles, m."""
-    leg_range: tuple[float, float] = (0.10, 0.38)
+    leg_range: Annotated[tuple[Positive, Positive], Ascending] = (0.10, 0.38)
     """Shortest and longest distance from the chassis' axis to an axle, m."""
-    stance: float = 0.20
+    stance: Positive = 0.20
     """Leg length at rest, m."""
-    leg_stiffness: float = 2500.0
+    leg_stiffness: Positive = 2500.0
     """N/m"""
-    leg_damping: float = 90.0
+    leg_damping: NonNegative = 90.0
     """N s/m"""
-    leg_stroke: float = 0.16
+    leg_stroke: NonNegative = 0.16
     """Change of leg length that an action of 1 asks for, m."""
-    leg_speed: float = 2.0
+    leg_speed: Positive = 2.0
     """Fastest change of the commanded leg length, m/s."""
-    wheel_torque: float = 7.0
+    wheel_torque: NonNegative = 7.0
     """Limit of each wheel's motor, N m."""
-    wheel_boost: float = 1.0
+    wheel_boost: NonNegative = 1.0
     """Surface speed that an action of 1 adds to the commanded speed, m/s."""
-    friction: float = 1.0
+    friction: NonNegative = 1.0
     """Of wheels and ground, each; pymunk multiplies them. Rubber on concrete is about 1."""
-    dt: float = 0.005
+    dt: Annotated[float, Interval(ge=1e-4, le=0.05)] = 0.005
     """Physics step, s."""
-    substeps: int = 8
+    substeps: Annotated[int, Interval(ge=1, le=1000)] = 8
     """Physics steps per control step: 25 Hz control."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 TOY_GRID = PatchGrid(ahead=1.2, behind=0.5, half_width=0.2, footprint=(0.3, 0.1))
