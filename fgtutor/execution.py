@@ -9,9 +9,11 @@ pure pursuit (Coulter, 1992).
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from jaxtyping import Float, Int
 from torch import Tensor
 from tqdm import tqdm
@@ -23,32 +25,41 @@ from fgtutor.robots.base import LocomotionEnv
 from fgtutor.robots.commands import LOOKAHEAD
 from fgtutor.specialist import Specialist
 from fgtutor.terrain import Terrain, World
+from fgtutor.validation import Count, Unbounded, check_fields
+
+Magnitude = Annotated[float, Interval(ge=0, le=1000)]
+"""A length, m, an angle, rad, or the error of one."""
+Factor = Annotated[float, Interval(ge=0, le=1e6)]
+"""A time, s, or what one is multiplied by."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FollowConfig:
     """How a route is followed, and when an episode is over."""
 
-    lookahead: float = LOOKAHEAD
+    lookahead: Magnitude = LOOKAHEAD
     """Distance to the point on the route that the robot steers for, m."""
-    goal_radius: float = 0.35
+    goal_radius: Magnitude = 0.35
     """The goal is reached within this distance of it, m."""
-    patience: float = 3.0
+    patience: Factor = 3.0
     """Time limit as a multiple of route length / speed, plus `grace`."""
-    grace: float = 5.0
+    grace: Factor = 5.0
     """Seconds added to the time limit."""
-    stuck_seconds: float = 10.0
+    stuck_seconds: Unbounded = 10.0
     """A robot that has come no further on its route for this long has run out of time too, s."""
-    hold_steps: int = 3
+    hold_steps: Count = 3
     """Hysteresis: a policy takes over once it has been wanted for this many control steps."""
-    start_noise: float = 0.03
+    start_noise: Magnitude = 0.03
     """Standard deviation of the start position, m."""
-    start_yaw_noise: float = 0.03
+    start_yaw_noise: Magnitude = 0.03
     """Standard deviation of the start yaw, rad."""
-    position_noise: float = 0.0
+    position_noise: Magnitude = 0.0
     """Standard deviation of each localisation fix, m; only the follower is misled by it."""
-    drift: float = 0.0
+    drift: Magnitude = 0.0
     """Growth of the localisation error, m per square root of a second (a random walk)."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +121,9 @@ def execute_batch(
     """Drive route i on terrain i with the policies of `zoo`, all at once; return the episodes.
 
     Trials on one `Terrain` stand on one tile, where they cannot meet: robots do not collide.
-    A route's policy indices count in the order of `zoo`. Raises `ConfigError` if the lists differ
-    in length, the zoo is empty or mixes robots, or a route names a policy that `zoo` lacks.
+    A route's policies are taken from `zoo` by their names; without names ("policy 0" and so on, as
+    `plan` calls them then) they count in its order. Raises `ConfigError` if the lists differ in
+    length, a seed is negative, the zoo is empty or mixes robots, or it lacks a policy of a route.
     """
     settings = config or FollowConfig()
     if not (len(routes) == len(terrains) == len(seeds)):
@@ -121,27 +133,49 @@ def execute_batch(
         )
     if not routes:
         return []
-    specialists = list(zoo.values())
-    robots = {specialist.robot for specialist in specialists}
+    if min(seeds) < 0:
+        raise ConfigError(f"seeds are numbers from 0, got {min(seeds)}")
+    robots = {specialist.robot for specialist in zoo.values()}
     if len(robots) != 1:
         raise ConfigError(f"a zoo to drive with holds one robot's policies, got {sorted(robots)}")
-    wanted = max((int(route.policies.max()) for route in routes if len(route.policies)), default=0)
-    if wanted >= len(specialists):
-        raise ConfigError(
-            f"a route uses policy number {wanted}, but the zoo holds {len(specialists)}: execute a "
-            "route with the zoo that it was planned with"
-        )
+    places = [_places(route, tuple(zoo)) for route in routes]
+    specialists = list(zoo.values())
+    team = [specialists[place] for place in {place for own in places for place in own.values()}]
+    speed = min(specialist.command[0] for specialist in team)
+    if not speed > 0:
+        raise ConfigError(f"the policies of a route drive ahead, one is commanded {speed} m/s")
     robot = env_class(robots.pop())
     episodes = replace(
         robot.episodes,
         train=False,
         stuck_seconds=math.inf,
-        history=max(specialist.history for specialist in specialists),
+        history=max(specialist.history for specialist in team),
     )
     tiles = {terrain: index for index, terrain in enumerate(dict.fromkeys(terrains))}
     env = robot(World([list(tiles)]), len(routes), config=episodes)
     where = torch.tensor([tiles[terrain] for terrain in terrains])
-    return _Drive(env, where, routes, specialists, seeds, settings).run(record_body, progress)
+    tracks = [_Track(route, own) for route, own in zip(routes, places, strict=True)]
+    drive = _Drive(env, where, tracks, specialists, seeds, settings, speed)
+    return drive.run(record_body, progress)
+
+
+def _places(route: Route, names: tuple[str, ...]) -> dict[int, int]:
+    """Return where each policy of a route stands among `names`, those of a zoo.
+
+    Raises `ConfigError` if one that is used does not.
+    """
+    unnamed = all(name == f"policy {index}" for index, name in enumerate(route.names))
+    order = {name: index for index, name in enumerate(names)}
+    if unnamed and not set(route.names) & order.keys():
+        order = dict(zip(route.names, range(len(names)), strict=False))
+    places = {i: order[name] for i, name in enumerate(route.names) if name in order}
+    used = set(route.policies.tolist()) or {0}
+    if missing := [route.names[i] for i in sorted(used - places.keys())]:
+        raise ConfigError(
+            f"routes name {', '.join(missing)}; the zoo has {', '.join(names)}: execute a route "
+            "with the zoo that it was planned with"
+        )
+    return places
 
 
 class _Drive:
@@ -151,23 +185,23 @@ class _Drive:
         self,
         env: LocomotionEnv,
         tiles: Int[Tensor, "trials"],
-        routes: Sequence[Route],
+        tracks: Sequence["_Track"],
         specialists: Sequence[Specialist],
         seeds: Sequence[int],
         config: FollowConfig,
+        speed: float,
     ) -> None:
         self.env, self.specialists, self.config = env, specialists, config
-        self.tracks = [_Track(route) for route in routes]
-        self.speed = min(specialist.command[0] for specialist in specialists)
+        self.tracks = tracks
         self.corners = env.offsets[0, tiles].cpu().numpy().astype(np.float64)
         self.dice = [np.random.default_rng(seed) for seed in seeds]
         self.limits = np.array(
             [
-                (config.patience * track.length / self.speed + config.grace) / env.control_dt
+                (config.patience * track.length / speed + config.grace) / env.control_dt
                 for track in self.tracks
             ]
         )
-        n = len(routes)
+        n = len(tracks)
         self.error = np.zeros((n, 2))
         self.active = np.array([track.policy for track in self.tracks])
         self.waiting = np.zeros(n, dtype=int)
@@ -182,7 +216,7 @@ class _Drive:
             for track, corner, dice in zip(self.tracks, self.corners, self.dice, strict=True)
         ]
         poses = torch.tensor(np.array(starts), dtype=torch.float32)
-        env.start(torch.arange(n), poses, self.speed)
+        env.start(torch.arange(n), poses, speed)
 
     def run(self, record_body: bool, progress: bool) -> list[Episode]:
         """Step until every robot has reached its goal, fallen or run out of time."""
@@ -193,7 +227,7 @@ class _Drive:
         bodies: list[list[np.ndarray]] = [[] for _ in range(n)]
         stuck = self.config.stuck_seconds / self.env.control_dt
         with tqdm(total=n, unit="trial", disable=not progress) as bar:
-            for step in range(1, math.ceil(self.limits.max()) + 1):
+            for step in range(1, max(1, math.ceil(self.limits.max())) + 1):
                 self._command(self._pose())
                 with torch.inference_mode():
                     actions = self._act()
@@ -222,7 +256,7 @@ class _Drive:
                 success=reason[i] == "reached",
                 reason=reason[i] or "timeout",
                 poses=np.array(poses[i]),
-                policies=np.array(policies[i]),
+                policies=np.array([self.tracks[i].own[place] for place in policies[i]]),
                 length=float(np.hypot(*np.diff(np.array(poses[i])[:, :2], axis=0).T).sum()),
                 seconds=len(poses[i]) * self.env.control_dt,
                 body=np.array(bodies[i]) if record_body else None,
@@ -271,24 +305,29 @@ class _Drive:
 
 
 class _Track:
-    """A route resampled every `SPACING` metres, which remembers how far along it the robot is."""
+    """A route resampled every `SPACING` metres, which remembers how far along it the robot is.
+
+    Its policies are numbered as `places` says, and `own` is the way back to the route's numbers.
+    """
 
     SPACING = 0.02
 
-    def __init__(self, route: Route) -> None:
+    def __init__(self, route: Route, places: Mapping[int, int]) -> None:
+        self.own = {place: index for index, place in places.items()}
         xy = np.asarray(route.xy, dtype=np.float64)
         at = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))))
         self.length = float(at[-1])
         distance = np.append(np.arange(0.0, self.length, self.SPACING), self.length)
         edge = np.clip(np.searchsorted(at, distance, "right") - 1, 0, max(len(at) - 2, 0))
         self.points = np.stack([np.interp(distance, at, xy[:, axis]) for axis in (0, 1)], axis=-1)
-        self.policies = np.asarray(route.policies)[edge] if len(at) > 1 else np.zeros(1, dtype=int)
+        named = route.policies[edge].tolist() if len(at) > 1 else [0]
+        self.policies = np.array([places[index] for index in named])
         self.nearest = 0
         self.idle = 0  # steps since it last came further
 
     @property
     def policy(self) -> int:
-        """The policy that the route names where the robot is."""
+        """The policy that the route names where the robot is, its place in the zoo."""
         return int(self.policies[self.nearest])
 
     def bearing(self, place: np.ndarray, distance: float, there: float = 0.0) -> float:

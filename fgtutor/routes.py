@@ -8,18 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
+from annotated_types import Interval, Len
 from jaxtyping import Float, Int
 
 from fgtutor import directions
 from fgtutor.errors import PlanningError
+from fgtutor.validation import parse_record
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Route:
-    """A planned route of n cells, hence n - 1 steps; a route of one cell has no step."""
+    """A planned route of n cells, hence n - 1 steps; a route of one cell has no step.
+
+    Raises:
+        PlanningError: The arrays do not fit each other, or a value is out of range.
+    """
 
     cells: Int[np.ndarray, "n 2"]
     """The cells (ix, iy) from start to goal."""
@@ -42,6 +48,31 @@ class Route:
     ood: Float[np.ndarray, "steps policies"] | None = None
     """w_ood of every policy at each step, if known."""
 
+    def __post_init__(self) -> None:
+        names, headings = self.names, len(directions.NAMES)
+        if not names or not all(isinstance(n, str) and n.isprintable() for n in names):
+            raise PlanningError(f"names should be printable texts, one per policy, got {names}")
+        if len(set(names)) < len(names):
+            raise PlanningError(f"each policy needs a name of its own, got {', '.join(names)}")
+        for name, (kind, shape) in _layout(len(self.headings), len(names)).items():
+            array = getattr(self, name)
+            if array is None and name in ("choices", "ood"):
+                continue
+            if not isinstance(array, np.ndarray) or array.shape != shape:
+                got = getattr(array, "shape", type(array).__name__)
+                raise PlanningError(f"{name} should be an array {shape}, is {got}")
+            if array.dtype.kind not in ("iu" if kind is int else "iuf"):
+                raise PlanningError(f"{name} should hold {kind.__name__}, holds {array.dtype}")
+            if not np.isfinite(array).all():
+                raise PlanningError(f"{name} should hold finite numbers")
+        for what, count in (("headings", headings), ("policies", len(names))):
+            if not all(0 <= index < count for index in getattr(self, what).tolist()):
+                raise PlanningError(f"{what} should be numbers from 0 to {count - 1}")
+        if (np.diff(self.cells.astype(int), axis=0) != directions.STEPS[self.headings]).any():
+            raise PlanningError("each cell should be the last one's neighbour along the heading")
+        if not (0 <= self.length < np.inf and (self.costs >= 0).all()):
+            raise PlanningError("length and costs should be numbers from 0")
+
     @property
     def cost(self) -> float:
         """The sum of the steps' costs."""
@@ -63,7 +94,7 @@ class Route:
                 "policy": self.names[self.policies[i]],
                 "F_max": float(self.feasibility[i]),
                 "cost": float(self.costs[i]),
-                "share": float(self.costs[i]) / total,
+                "share": float(self.costs[i]) / total if total else 0.0,
             }
             if self.choices is not None:
                 step["F"] = dict(zip(self.names, self.choices[i].tolist(), strict=True))
@@ -84,29 +115,19 @@ class Route:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
         """Rebuild a route from `to_json`; raises `PlanningError` if it is not one."""
+        told = "not a route (pass what Route.to_json() gave, unchanged)"
+        record = vars(parse_record(_Record, data, PlanningError, told))
+        layout = _layout(len(record["cells"]) - 1, len(record["names"]))
         try:
-            n, policies = len(data["cells"]), len(data["names"])
-            shapes = {
-                "cells": (int, (n, 2)),
-                "xy": (float, (n, 2)),
-                "headings": (int, (n - 1,)),
-                "policies": (int, (n - 1,)),
-                "feasibility": (float, (n - 1,)),
-                "costs": (float, (n - 1,)),
-            }
-            for name in ("choices", "ood"):
-                if data.get(name) is not None:
-                    shapes[name] = (float, (n - 1, policies))
+            # An empty list has lost its other dimensions: give them back.
             arrays = {
-                # An empty list has lost its other dimensions: give them back.
-                name: np.array(data[name], dtype=kind).reshape(shape)
-                for name, (kind, shape) in shapes.items()
+                name: np.array(record[name], dtype=kind).reshape(shape)
+                for name, (kind, shape) in layout.items()
+                if record[name] is not None
             }
-            return cls(length=float(data["length"]), names=tuple(data["names"]), **arrays)
-        except (KeyError, TypeError, ValueError) as error:
-            raise PlanningError(
-                f"not a route: {error!r}; pass what Route.to_json() gave, unchanged"
-            ) from error
+            return cls(length=record["length"], names=record["names"], **arrays)
+        except ValueError as error:
+            raise PlanningError(f"{told}: {error}") from error
 
     def __repr__(self) -> str:
         if not len(self.headings):
@@ -118,3 +139,38 @@ class Route:
             f"Route({len(self.headings)} steps, {self.length:.2f} m, cost {self.cost:.2f}, "
             f"F {low:.2f}..{high:.2f}, {self.switches} switches: {order})"
         )
+
+
+_Index = Annotated[int, Interval(ge=0, le=10**6)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Record:
+    """A route as JSON; see `Route`."""
+
+    cells: Annotated[list[tuple[_Index, _Index]], Len(1)]
+    xy: list[tuple[float, float]]
+    headings: list[_Index]
+    policies: list[_Index]
+    feasibility: list[float]
+    costs: list[float]
+    length: float
+    names: tuple[str, ...]
+    choices: list[list[float]] | None
+    ood: list[list[float]] | None
+    cost: float
+    switches: int
+
+
+def _layout(steps: int, policies: int) -> dict[str, tuple[type, tuple[int, ...]]]:
+    """Return type and shape of each array of a route."""
+    return {
+        "cells": (int, (steps + 1, 2)),
+        "xy": (float, (steps + 1, 2)),
+        "headings": (int, (steps,)),
+        "policies": (int, (steps,)),
+        "feasibility": (float, (steps,)),
+        "costs": (float, (steps,)),
+        "choices": (float, (steps, policies)),
+        "ood": (float, (steps, policies)),
+    }

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from fgtutor import execution
+from fgtutor.directions import STEPS
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.execution import FollowConfig, execute, execute_batch
@@ -59,8 +60,14 @@ def test_it_starts_towards_where_it_will_steer_not_along_the_first_cell(make_rol
     cells = route.cells.copy()
     cells[1:3] = cells[0] + np.array([[1, 1], [2, 2]])
     cells[3:, 1] = cells[2, 1]
+    headings = [
+        next(k for k, s in enumerate(STEPS) if (s == d).all()) for d in np.diff(cells, axis=0)
+    ]
     x, y = elevation.centres
-    route = replace(route, cells=cells, xy=np.stack((x[cells[:, 0]], y[cells[:, 1]]), axis=-1))
+    route = replace(
+        route, cells=cells, xy=np.stack((x[cells[:, 0]], y[cells[:, 1]]), axis=-1),
+        headings=np.array(headings),
+    )  # fmt: skip
     terrain, sure = Terrain.from_elevation(elevation, *ends), FollowConfig(start_yaw_noise=0)
     episode = execute(route, terrain, {"roll": make_rolling()}, config=sure)
     assert episode.success
@@ -172,7 +179,7 @@ def test_what_cannot_be_driven_is_refused(make_rolling):
     route, terrain = task((1.0, 2.0), (3.0, 2.0))
     with pytest.raises(ConfigError, match="one route, terrain and seed"):
         execute_batch([route], [terrain], {"roll": make_rolling()}, seeds=[])
-    with pytest.raises(ConfigError, match="policy number 2"):
+    with pytest.raises(ConfigError, match="policy 2; the zoo has roll"):
         execute(straight(flat(), (1, 2), (3, 2), policy=2), terrain, {"roll": make_rolling()})
     with pytest.raises(ConfigError, match="one robot"):
         execute(route, terrain, {})
@@ -184,3 +191,85 @@ def test_execution_leaves_the_policy_as_it_was(make_rolling):
     before = {k: v.clone() for k, v in specialist.policy.state_dict().items()}
     execute(route, terrain, {"roll": specialist})
     assert all(torch.equal(v, before[k]) for k, v in specialist.policy.state_dict().items())
+
+
+@pytest.fixture
+def two(make_rolling):
+    """A route whose second half another policy drives, the ground, and both policies by name."""
+    elevation = flat()
+    policies = np.zeros((60, 40, 8), dtype=int)
+    policies[30:] = 1
+    ends = {"start": (1.0, 2.0), "goal": (4.5, 2.0)}
+    names = ["steps", "gaps"]
+    fused = np.ones(policies.shape)
+    route = plan(fused, policies, grid=elevation, cost="length", names=names, **ends)
+    zoo = {name: make_rolling(name) for name in names}
+    return route, Terrain.from_elevation(elevation, *ends.values()), zoo
+
+
+def test_policies_are_taken_by_name_whatever_the_order_of_the_zoo(two, make_rolling):
+    route, terrain, zoo = two
+    stranger = make_rolling("other", command=(0.2, 0.0, 0.0))
+    zoos = [zoo, dict(reversed(zoo.items())), {"other": stranger, **dict(reversed(zoo.items()))}]
+    asked = {name: [] for name in zoo}
+    for name, specialist in zoo.items():
+        specialist.policy.register_forward_hook(lambda *_, name=name: asked[name].append(1))
+    episodes, counts = [], []
+    for one in zoos:
+        for calls in asked.values():
+            calls.clear()
+        episodes.append(execute(route, terrain, one))
+        counts.append({name: len(calls) for name, calls in asked.items()})
+    for episode in episodes:
+        assert episode.success
+        assert np.array_equal(episode.poses, episodes[0].poses)
+        # Policies are numbered as the route numbers them.
+        assert np.array_equal(episode.policies, episodes[0].policies)
+    assert counts[0] == counts[1] == counts[2] and all(counts[0].values())
+    assert counts[0]["steps"] == (episodes[0].policies == 0).sum()
+
+
+def test_routes_of_different_policies_drive_in_one_batch(two):
+    route, terrain, zoo = two
+    turned = replace(route, names=tuple(reversed(route.names)), policies=1 - route.policies)
+    first, second = execute_batch([route, turned], [terrain] * 2, zoo, seeds=[3, 3])
+    assert first.success and np.array_equal(first.policies, 1 - second.policies)
+
+
+def test_a_policy_that_the_zoo_lacks_is_named(two):
+    route, terrain, zoo = two
+    with pytest.raises(ConfigError, match="routes name gaps; the zoo has steps"):
+        execute(route, terrain, {"steps": zoo["steps"]})
+    # What a route does not use need not be there.
+    only = replace(route, policies=np.zeros_like(route.policies))
+    assert execute(only, terrain, {"steps": zoo["steps"]}).success
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *((f, v) for f in FollowConfig.__annotations__ for v in (math.nan, -1, "1", None)),
+        *((f, math.inf) for f in FollowConfig.__annotations__ if f != "stuck_seconds"),
+        ("lookahead", 1e308),
+        ("patience", 1e308),
+        ("hold_steps", 0),
+        ("hold_steps", 1.5),
+        ("stuck_seconds", 0.0),
+    ],
+)
+def test_a_setting_that_cannot_work_is_named(field, value):
+    with pytest.raises(ConfigError, match=f"^{field}: "):
+        FollowConfig(**{field: value})
+
+
+def test_no_time_at_all_is_one_step(make_rolling):
+    route, terrain = task((1.0, 2.0), (4.0, 2.0))
+    none = FollowConfig(patience=0.0, grace=0.0)
+    episode = execute(route, terrain, {"roll": make_rolling()}, config=none)
+    assert episode.reason == "timeout" and len(episode.poses) == 1
+
+
+def test_a_negative_seed_is_refused(make_rolling):
+    route, terrain = task((1.0, 2.0), (4.0, 2.0))
+    with pytest.raises(ConfigError, match="seeds are numbers from 0, got -1"):
+        execute(route, terrain, {"roll": make_rolling()}, seed=-1)

@@ -4,6 +4,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from fgtutor.__main__ import main
 from fgtutor.baselines import ours
 from fgtutor.errors import ConfigError, ReportError, StorageError, TerrainError
 from fgtutor.evaluation import ablation, success
@@ -259,3 +260,32 @@ def test_the_ablation_has_a_line_a_planner(zoo, capsys):
     rows = {row["policy"]: row for row in ablation.evaluate(config)}  # from the folder
     assert [rows[name]["successes"] for name in ("ours", "no-fusion", "occupancy+P")] == [2, 2, 2]
     assert "22 trials in all" in (config.out / "table.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"terrains": ("steps", "gaps", "steps")}, "terrains: give each only once"),
+        ({"policies": ("ours", "ours")}, "policies: give each only once"),
+        ({"trials": 0}, "trials: "),
+        ({"trials": 10**9}, "trials: "),
+        ({"difficulty": float("nan")}, "difficulty: "),
+        ({"difficulty": 1.5}, "difficulty: "),
+        ({"switch_cost": -1.0}, "switch_cost: "),
+        ({"switch_cost": float("inf")}, "switch_cost: "),
+        ({"f_min": 0.0}, "f_min: "),
+        ({"f_min": 2.0}, "f_min: "),
+        ({"seed": -1}, "seed: "),
+        ({"taus": "mine"}, "taus: "),
+        ({"workers": -1}, "workers: "),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(fields, says):
+    with pytest.raises(ConfigError, match=f"^{says}"):
+        MatrixConfig(**fields)
+
+
+def test_a_terrain_given_twice_is_one_line_on_the_command_line(capsys):
+    words = "evaluate matrix --terrains steps steps --trials 1"
+    assert main(words.split()) == 2
+    assert "terrains: give each only once, 'steps' is there twice" in capsys.readouterr().err

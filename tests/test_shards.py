@@ -120,7 +120,20 @@ def test_a_shard_of_other_settings_is_refused(tmp_path, diary):
         squares(mine, diary)
 
 
-@pytest.mark.parametrize("content", [b"", b'{"rows": [', b"\xff\xfe", b"[1, 2]", b"{}"])
+GOOD = {"settings": {}, "rows": [{"x": 1}], "seconds": 1.0, "machine": {}}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"", b'{"rows": [', b"\xff\xfe", b"[1, 2]", b"{}", b"[" * 100_000),
+        *(json.dumps({k: v for k, v in GOOD.items() if k != gone}).encode() for gone in GOOD),
+        *(json.dumps(GOOD | {k: "text"}).encode() for k in [*GOOD, "more"]),
+        *(json.dumps(GOOD | {"seconds": v}).encode() for v in (-1, 10**400, None, True, [])),
+        *(json.dumps(GOOD | {"rows": v}).encode() for v in ({}, [[]], [1], None)),
+        json.dumps(GOOD | {"seconds": float("nan")}).encode(),
+    ],
+)
 def test_a_shard_that_cannot_be_read_is_done_again(tmp_path, diary, content):
     config = SquareConfig(out=tmp_path / "out")
     squares(config, diary)
@@ -136,6 +149,15 @@ def test_a_folder_of_something_else_is_refused(tmp_path, diary):
         squares(SquareConfig(out=tmp_path / "photos"), diary)
     with pytest.raises(ReportError, match="not a report folder"):
         squares(SquareConfig(merge=(tmp_path / "missing",)), diary)
+    for text in ("[1]", "[" * 100_000, '{"a": ', "\udcff"):
+        bad = tmp_path / "photos" / "settings.json"
+        bad.write_bytes(text.encode("utf-8", "surrogateescape"))
+        with pytest.raises(ReportError, match="not a report folder"):
+            squares(SquareConfig(out=tmp_path / "photos"), diary)
+    (tmp_path / "photos" / "settings.json").write_text(json.dumps({"\x1b[2J": "x" * 10**6}))
+    with pytest.raises(ReportError, match="other settings") as caught:
+        squares(SquareConfig(out=tmp_path / "photos"), diary)
+    assert "\x1b" not in str(caught.value) and len(str(caught.value)) < 3000
     assert diary.read_text() == ""  # refused before the work
     (tmp_path / "empty").mkdir()
     assert squares(SquareConfig(out=tmp_path / "empty"), diary).complete
@@ -161,3 +183,17 @@ def test_a_part_needs_a_folder():
         RunConfig(part=(1, 2))
     with pytest.raises(ConfigError, match="workers"):
         RunConfig(workers=-1)
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"workers": -1}, "workers: "),
+        ({"workers": 1.5}, "workers: "),
+        ({"part": (0, 2)}, "part: 0: "),
+        ({"part": (3, 2)}, "no part 3 of 2"),
+    ],
+)
+def test_a_run_that_cannot_be_is_refused(tmp_path, fields, says):
+    with pytest.raises(ConfigError, match=says):
+        RunConfig(out=tmp_path, **fields)

@@ -6,11 +6,14 @@ Source: paper, Sec. III-B (taus) and III-C (edge cost, f_min).
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from annotated_types import Interval
 
 from fgtutor.evaluation.provenance import digest
 from fgtutor.evaluation.shards import RunConfig
 from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo
+from fgtutor.validation import Seed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,11 +22,11 @@ class PlannedConfig(RunConfig):
 
     robot: str = "toy"
     """Which robot."""
-    seed: int = 0
+    seed: Seed = 0
     """What grounds and starts are drawn from."""
     taus: Literal["paper", "calibrated"] = "calibrated"
     """Thresholds of w_ood."""
-    f_min: float = 0.1
+    f_min: Annotated[float, Interval(gt=0, le=1)] = 0.1
     """Edges less feasible than this do not exist."""
     cost: Literal["inverse", "length"] = "length"
     """Edge cost: 1 / F times the step's length; or 1 / F alone (the paper), by which a diagonal

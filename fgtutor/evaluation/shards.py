@@ -23,6 +23,7 @@ from fgtutor import __version__
 from fgtutor.errors import ConfigError, ReportError
 from fgtutor.evaluation.runner import Result, Row, Task, run_tasks
 from fgtutor.storage import make_folder, write_json
+from fgtutor.validation import Count, CountOrZero, NonNegative, check_fields, read_record
 
 T = TypeVar("T")
 SETTINGS, SHARDS = "settings.json", "shards"
@@ -32,26 +33,34 @@ SETTINGS, SHARDS = "settings.json", "shards"
 class RunConfig:
     """Where the tasks of an evaluation run, and where their rows are kept."""
 
-    workers: int = 0
+    workers: CountOrZero = 0
     """Processes; 0 takes one per core."""
     ray: str | None = None
     """Address of a Ray cluster to run on instead: HOST:PORT, auto, or local."""
     out: Path | None = None
     """Report folder. Finished tasks are kept in it, and the same command goes on from there."""
-    part: tuple[int, int] = (1, 1)
+    part: tuple[Count, Count] = (1, 1)
     """Do only this part of the tasks: 2 4 is the second of four."""
     merge: tuple[Path, ...] = ()
     """Report folders of other parts: their finished tasks are taken over."""
 
     def __post_init__(self) -> None:
+        check_fields(self)
         which, of = self.part
-        if self.workers < 0 or not 1 <= which <= of:
-            raise ConfigError(
-                f"need workers >= 0 and a part from 1 of its number, got {self.workers} and "
-                f"{which} of {of}"
-            )
+        if which > of:
+            raise ConfigError(f"part: there is no part {which} of {of}")
         if of > 1 and self.out is None:
             raise ConfigError("a part is of use only in a folder: say --out FOLDER as well")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Shard:
+    """What a shard's file holds: a `Result`, and the settings of its run."""
+
+    settings: dict[str, Any]
+    rows: list[Row]
+    seconds: NonNegative
+    machine: dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -146,14 +155,15 @@ def finished(
     done = {}
     for folder in folders:
         for task in tasks:
-            shard = _read(_shard(folder, task))
-            if not isinstance(shard, dict) or "rows" not in shard:
+            try:
+                shard = read_record(_Shard, _shard(folder, task), ReportError)
+            except ReportError:
                 continue
-            if shard.pop("settings", None) != settings:
+            if shard.settings != settings:
                 raise ReportError(
                     f"{_shard(folder, task)} comes from a run with other settings: remove it"
                 )
-            done[task.name] = Result(**shard)
+            done[task.name] = Result(rows=shard.rows, seconds=shard.seconds, machine=shard.machine)
     return done
 
 
@@ -171,14 +181,6 @@ def _keep(folder: Path, task: Task, result: Result, settings: dict[str, Any]) ->
     write_json(_shard(folder, task), {"settings": settings, **asdict(result)})
 
 
-def _read(path: Path) -> Any:
-    """Return what a JSON file holds, or None if there is none that can be read."""
-    try:
-        return json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return None
-
-
 def _open(folder: Path, settings: dict[str, Any]) -> None:
     make_folder(folder / SHARDS)
     if not (folder / SETTINGS).exists():
@@ -189,15 +191,17 @@ def _check(folder: Path, settings: dict[str, Any], *, new: bool) -> None:
     """Raise `ReportError` unless the folder is this run's, or empty where a `new` one may begin."""
     if new and folder.is_dir() and not any(folder.iterdir()):
         return
-    theirs = _read(folder / SETTINGS)
-    if not isinstance(theirs, dict):
+    try:
+        theirs = read_record(dict[str, Any], folder / SETTINGS, ReportError)
+    except ReportError as error:
         raise ReportError(
-            f"{folder} is not a report folder: it holds no readable {SETTINGS}; choose another one"
-        )
+            f"{folder} is not a report folder ({error}): choose another one"
+        ) from error
     if theirs != settings:
         names = sorted(settings.keys() | theirs.keys())
         changes = (
-            f"{name} was {theirs.get(name)!r} and is {settings.get(name)!r}"
+            f"{name if name in settings else repr(name)[:40]} was {theirs.get(name)!r:.200} "
+            f"and is {settings.get(name)!r:.200}"
             for name in names
             if theirs.get(name) != settings.get(name)
         )

@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Interval
 
 from fgtutor.baselines import planners
-from fgtutor.errors import ConfigError, ReportError
+from fgtutor.errors import ReportError
 from fgtutor.evaluation import report
 from fgtutor.evaluation.chart import share_chart
 from fgtutor.evaluation.cost import Cost, estimate
@@ -27,6 +28,8 @@ from fgtutor.evaluation.shards import collect, settings_of
 from fgtutor.evaluation.trials import Ground, drive
 from fgtutor.storage import check_writable, write_json
 from fgtutor.terrain import Terrain, make_terrain
+from fgtutor.validation import NonNegative
+from fgtutor.validation import Share as Fraction
 
 GROUNDS = 25
 """Grounds of one task, where each is driven once."""
@@ -35,29 +38,27 @@ PAPER_GROUNDS, PAPER_TRIALS = 40, 10_000
 CLEARANCE = 0.5
 """Distance of a drawn start or goal from the obstacle and from the map's border, m."""
 
+Trials = Annotated[int, Interval(ge=1, le=50_000)]
+"""A number of trials, as many as the files of a report hold."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrialsConfig(PlannedConfig):
     """What success rates are measured on."""
 
-    trials: int | None = None
+    trials: Trials | None = None
     """Trials per policy and terrain; default: 50, for the paper's protocol its 10,000. With more
     of them in the same folder, only the new ones are driven, but for the paper's protocol."""
     protocol: Literal["grounds", "paper"] = "grounds"
     """"grounds" crosses a new ground in each trial; "paper" draws 40 grounds with a start and a
     goal each (mixed: its own) and crosses each 250 times."""
-    difficulty: float = 1.0
+    difficulty: Fraction = 1.0
     """Difficulty of all terrains."""
-    switch_cost: float = 0.0
+    switch_cost: NonNegative = 0.0
     """Extra cost of changing the policy, in the unit of `cost` (metres or steps where F is 1); 0 is
     the paper's."""
     json: Path | None = None
     """Write the table's rows here."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.trials is not None and self.trials < 1:
-            raise ConfigError(f"need trials >= 1, got {self.trials}")
 
     @property
     def count(self) -> int:

@@ -88,24 +88,23 @@ def drive(
             except PlanningError:
                 trials += (_trial(terrain, name, seed, "no_route") for seed in ground.seeds)
             else:
-                team = jobs.setdefault(route.names, [])
-                team += ((route, terrain, seed) for seed in ground.seeds)
-        for names, work in jobs.items():
-            team = {policy: zoo[policy] for policy in names}
-            trials += _episodes(name, work, team, follow)
+                work = jobs.setdefault(route.names, [])
+                work += ((route, terrain, seed) for seed in ground.seeds)
+        for work in jobs.values():
+            trials += _episodes(name, work, zoo, follow)
     return trials
 
 
 def _episodes(
     name: str,
     work: Sequence[tuple[Route, Terrain, int]],
-    team: Mapping[str, Specialist],
+    zoo: Mapping[str, Specialist],
     follow: FollowConfig | None,
 ) -> Iterator[Trial]:
     """Drive routes, `EPISODES` at a time."""
     for first in range(0, len(work), EPISODES):
         routes, terrains, seeds = zip(*work[first : first + EPISODES], strict=True)
-        episodes = execute_batch(routes, terrains, team, seeds=seeds, config=follow)
+        episodes = execute_batch(routes, terrains, zoo, seeds=seeds, config=follow)
         for terrain, seed, episode in zip(terrains, seeds, episodes, strict=True):
             yield replace(
                 _trial(terrain, name, seed, episode.reason),

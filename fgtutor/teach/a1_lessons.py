@@ -8,7 +8,6 @@ where none does, stick figures take its place, so that every lesson runs everywh
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -239,21 +238,8 @@ def drive_together(
     A batch costs hardly more than one walk. Each episode counts policies as its own route does.
     Terrains must have one size. Raises `ConfigError` if a route names a policy that the zoo lacks.
     """
-    place = {name: index for index, name in enumerate(zoo)}
-    missing = sorted({name for route, _, _ in jobs for name in route.names} - place.keys())
-    if missing:
-        raise ConfigError(f"routes name {', '.join(missing)}; the zoo has {', '.join(zoo)}")
-    numbers = [np.array([place[name] for name in route.names]) for route, _, _ in jobs]
-    routes = [
-        replace(route, policies=number[route.policies], names=tuple(zoo), choices=None, ood=None)
-        for (route, _, _), number in zip(jobs, numbers, strict=True)
-    ]
-    terrains, seeds = [terrain for _, terrain, _ in jobs], [seed for _, _, seed in jobs]
-    episodes = execute_batch(routes, terrains, zoo, seeds=seeds, config=config)
-    return [
-        replace(episode, policies=(episode.policies[:, None] == number).argmax(axis=1))
-        for episode, number in zip(episodes, numbers, strict=True)
-    ]
+    routes, terrains, seeds = zip(*jobs, strict=True) if jobs else ((), (), ())
+    return execute_batch(routes, terrains, zoo, seeds=seeds, config=config)
 
 
 def daring_route(
