@@ -1,6 +1,7 @@
 """Values that cross from a submission: unchanged, plain, and never more than what they are."""
 
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -28,12 +29,45 @@ Q1, Q3 = "ex10.q1", "ex10.q3"
         {"outcome": "passed"},
         {"changed": [1]},
         {"changed": -1},
+        {"changed": 0.0},
+        {"changed": 10**30},
+        {"changed": 0, "answers": None, "points": 100},
+        {"answers": None, "detail": None},
+        {"answers": [float("nan")]},
+        {"answers": [[]] * 10**6},
+        {"answers": [{"list": [{"list": []}] * 10**5}]},
+        {"answers": [{"array": ["float64", [0, 10**18], ""]}]},
+        {"answers": [{"array": ["float64", "1", "AAAAAAAA8D8="]}]},
+        {"answers": [{"array": [["float64"], [1], "AAAAAAAA8D8="]}]},
+        {"answers": [{"array": None}]},
+        {"answers": [{"list": "passed"}]},
+        {"answers": [{"tuple": ["x"]}] * 3, "question": 7},
     ],
 )
 def test_a_forged_reply_never_passes(reply):
     for question in (find(Q1), find(Q3)):
         verdict = Judge(question, question.cases(0)).judge(reply)
         assert verdict.outcome in (CRASHED, WRONG)
+
+
+def test_a_text_among_numbers_takes_no_more_memory_than_it_has():
+    """Numpy would make every number as wide as the text: 400 MB here."""
+    bomb = {"answers": [{"list": ["x" * 10_000, *[1] * 10_000]}]}
+    tracemalloc.start()
+    try:
+        verdict = Judge(find(Q3), None).judge(bomb)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+    assert verdict.outcome == WRONG
+
+
+@pytest.mark.parametrize(
+    "answer", ["x", {"list": [1.0, 2.0]}, {"list": ["x", 1]}, {"list": []}, 1.5]
+)
+def test_no_wrong_answer_is_told_the_number_to_find(answer):
+    detail = Judge(find(Q3), None).judge({"answers": [answer]}).detail
+    assert "5.0" not in detail
 
 
 def test_a_deep_reply_is_unreadable_not_an_end():

@@ -28,8 +28,10 @@ class TooSlow(BaseException):
 
 
 @contextmanager
-def time_limit(seconds: float) -> Iterator[None]:
-    """Raise `TooSlow` in the block after `seconds` of CPU time, or `PATIENCE` times that by clock.
+def time_limit(seconds: float, patience: float = PATIENCE) -> Iterator[None]:
+    """Raise `TooSlow` in the block after `seconds` of CPU time, or `patience` times that by clock.
+
+    With patience 0 the clock does not count: someone else watches whether the block sleeps.
 
     Where there are no such timers (Windows, threads) there is no limit: interrupt the kernel.
     """
@@ -43,7 +45,7 @@ def time_limit(seconds: float) -> Iterator[None]:
 
     clocks = {
         signal.SIGPROF: (signal.ITIMER_PROF, seconds),
-        signal.SIGALRM: (signal.ITIMER_REAL, PATIENCE * seconds),
+        signal.SIGALRM: (signal.ITIMER_REAL, patience * seconds),
     }
     before = {number: signal.signal(number, stop) for number in clocks}
     try:
@@ -57,7 +59,9 @@ def time_limit(seconds: float) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def ask(target: Any, cases: Sequence[tuple] | None, seconds: float) -> dict[str, Any]:
+def ask(
+    target: Any, cases: Sequence[tuple] | None, seconds: float, patience: float = PATIENCE
+) -> dict[str, Any]:
     """Return {"answers": [...]}, encoded, or {"outcome": ..., "detail": ...}.
 
     With `cases` None the target is itself the answer. "changed" counts the argument that the
@@ -66,12 +70,13 @@ def ask(target: Any, cases: Sequence[tuple] | None, seconds: float) -> dict[str,
     if target is ... or target is None:
         return {"outcome": NOT_STARTED, "detail": "it still holds the three dots"}
     try:
-        with time_limit(seconds):
+        with time_limit(seconds, patience):
             try:
                 if cases is None:
                     return {"answers": [encode(target)]}
                 if not callable(target):
-                    return {"outcome": CRASHED, "detail": f"a function is expected, not {target!r}"}
+                    detail = f"a function is expected, not {target!r:.{LONGEST}}"
+                    return {"outcome": CRASHED, "detail": detail}
                 return _call(target, cases)
             except NotImplementedError:
                 return {

@@ -1,19 +1,30 @@
 """What a submission's process may still do: compute and read Python's own files, and nothing else.
 
 Reads limits; changes the calling process for good and gives the names of the protections in force.
-Three layers: resource limits (POSIX), a seccomp filter by which the kernel refuses every system
-call that computing does not need (Linux), and an audit hook that refuses the same by name and keeps
-other people's files unread (everywhere, but a determined attacker can get around a hook in his own
-process). Sources: seccomp(2), setrlimit(2), PEP 578.
+Four layers: resource limits (POSIX), a Landlock domain in which the kernel opens nothing but
+Python's own files (Linux 5.13), a seccomp filter by which it refuses every system call that
+computing does not need (Linux), and an audit hook that refuses the same by name (everywhere, but a
+determined attacker can get around a hook in his own process). Sources: landlock(7), seccomp(2),
+setrlimit(2), PR_SET_PDEATHSIG(2const), PEP 578.
 """
 
 import ctypes
+import math
 import os
 import platform
+import signal
 import struct
 import sys
+import sysconfig
+import time
+from collections.abc import Collection, Iterator
 from contextlib import suppress
+from glob import escape, glob
 from importlib.abc import MetaPathFinder
+
+NO_NEW_PROCESS, FILES_UNREAD = "no new process", "other files unread"
+WALLS = frozenset({NO_NEW_PROCESS, FILES_UNREAD})
+"""The protections that only a kernel gives, and that hold against anybody: seccomp and Landlock."""
 
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 """Flags of `open` that could change a file."""
@@ -42,7 +53,14 @@ _OPEN = {"x86_64": ((2, 1), (257, 2)), "aarch64": ((56, 2),)}
 _ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 _LOAD, _EQUAL, _ANY_BIT, _RETURN = 0x20, 0x15, 0x45, 0x06
 _ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050001, 0x80000000  # refuse with EPERM
-_PR_SET_NO_NEW_PRIVS, _PR_SET_SECCOMP, _SECCOMP_MODE_FILTER = 38, 22, 2
+_PR_SET_PDEATHSIG, _PR_SET_NO_NEW_PRIVS, _PR_SET_SECCOMP, _SECCOMP_MODE_FILTER = 1, 38, 22, 2
+
+# include/uapi/linux/landlock.h. The three system calls have the same numbers on every machine.
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
+_RULESET_VERSION, _RULE_PATH_BENEATH = 1, 1
+_READ_FILE, _READ_DIR = 1 << 2, 1 << 3
+_FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
+"""How many rights over files each version of Landlock knows; later ones know as many as the 5th."""
 
 _REFUSED = frozenset(
     (
@@ -73,14 +91,47 @@ _REFUSED = frozenset(
 """Audit events of what a submission has no business doing."""
 
 
-def confine(*, memory_mb: int, cpu_seconds: float) -> list[str]:
-    """Give up rights for good; return what is in force. Our modules loaded so far stay usable."""
+def confine(*, grader: int, memory_mb: int, cpu_seconds: float) -> list[str]:
+    """Give up rights for good; return what is in force. Our modules loaded so far stay usable.
+
+    `grader` is the process with which this one ends; `cpu_seconds` is what it may use from now on.
+    """
     in_force = _limit(memory_mb, cpu_seconds)
+    if sys.platform == "linux":
+        _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != grader:  # it ended before we asked to be told
+            os._exit(1)
+        _prctl(_PR_SET_NO_NEW_PRIVS, 1)
+    folders, closed = readable()
+    if _wall_off_files(folders, closed):
+        in_force.append(FILES_UNREAD)
     if _filter_system_calls():
-        in_force += ["no new process", "no network", "no signal to others", "no file written"]
-    _watch()
+        in_force += [NO_NEW_PROCESS, "no network", "no signal to others", "no file written"]
+    _watch(folders, closed)
     sys.meta_path.insert(0, _Offered())
-    return [*in_force, "other files unread"]
+    return in_force
+
+
+def readable() -> tuple[list[str], list[str]]:
+    """Return what computing needs to read, folders and files, and what stays closed inside them.
+
+    That is Python's library, what is installed for it and what those load; our own package, with
+    the answers, is closed wherever there is a copy, and so is the clone that it lies in.
+    """
+    real = os.path.realpath
+    prefixes = dict.fromkeys((sys.prefix, sys.base_prefix, sys.exec_prefix, "/usr", "/"))
+    libraries = [os.path.join(prefix, lib) for prefix in prefixes for lib in ("lib", "lib64")]
+    packages = [p for p in sys.path if os.path.basename(p) in ("site-packages", "dist-packages")]
+    paths = sysconfig.get_paths()
+    folders = [*libraries, *packages, paths["stdlib"], paths["platstdlib"], "/usr/share/zoneinfo"]
+    files = ["/dev/null", "/dev/urandom", "/dev/random", "/etc/ld.so.cache", "/etc/localtime"]
+    found = {real(path) for path in (*folders, *files) if os.path.exists(path)}
+    # pip leaves "~gtutor" behind when it is interrupted.
+    inside = ("*gtutor*", "python*/*-packages/*gtutor*")
+    copies = [os.path.join(escape(folder), name) for folder in found for name in inside]
+    package = os.path.dirname(os.path.dirname(real(__file__)))
+    closed = {package, os.path.dirname(package), *(c for name in copies for c in glob(name))}
+    return sorted(found), sorted(closed - found)
 
 
 def _limit(memory_mb: int, cpu_seconds: float) -> list[str]:
@@ -89,7 +140,7 @@ def _limit(memory_mb: int, cpu_seconds: float) -> list[str]:
     except ImportError:  # Windows
         return []
     wanted = {
-        "CPU time": (resource.RLIMIT_CPU, round(cpu_seconds)),
+        "CPU time": (resource.RLIMIT_CPU, math.ceil(cpu_seconds + time.process_time())),
         "memory": (resource.RLIMIT_AS, memory_mb * 2**20),
         "file size": (resource.RLIMIT_FSIZE, 0),
         "open files": (resource.RLIMIT_NOFILE, 64),
@@ -105,6 +156,65 @@ def _limit(memory_mb: int, cpu_seconds: float) -> list[str]:
     return in_force
 
 
+def landlock_version() -> int:
+    """Return which version of Landlock the kernel has, 0 for none."""
+    return max(0, _syscall(_CREATE_RULESET, 0, 0, _RULESET_VERSION))
+
+
+def _syscall(number: int, *values: int | bytes) -> int:
+    if sys.platform != "linux":
+        return -1
+    syscall = ctypes.CDLL(None, use_errno=True).syscall
+    syscall.restype = ctypes.c_long
+    # Integers as whole registers: ctypes would pass 32 bits.
+    return syscall(number, *(ctypes.c_long(v) if isinstance(v, int) else v for v in values))
+
+
+def _wall_off_files(folders: Collection[str], closed: Collection[str]) -> bool:
+    """Let the kernel open nothing but `folders`, for reading; return whether it can (Landlock)."""
+    version = landlock_version()
+    if not version:
+        return False
+    # struct landlock_ruleset_attr {u64 handled_access_fs, handled_access_net, scoped;}, of which
+    # older kernels know the beginning: TCP from version 4, signals and sockets from version 6.
+    rights = (1 << _FILE_RIGHTS[min(version, 5)]) - 1
+    ruleset = struct.pack("QQQ", rights, 3, 3)[: 24 if version >= 6 else 16 if version >= 4 else 8]
+    handle = _syscall(_CREATE_RULESET, ruleset, len(ruleset), 0)
+    for folder in folders:
+        for path, access in _rules(folder, closed):
+            try:
+                place = os.open(path, os.O_PATH | os.O_CLOEXEC)
+            except OSError:  # gone, or not for this user to read in any case
+                continue
+            # struct landlock_path_beneath_attr {u64 allowed_access; s32 parent_fd;}, packed
+            rule = struct.pack("=Qi", access, place)
+            failed = _syscall(_ADD_RULE, handle, _RULE_PATH_BENEATH, rule, 0)
+            os.close(place)
+            if failed:
+                raise OSError(ctypes.get_errno(), "Landlock takes no rule for", path)
+    confined = _syscall(_RESTRICT_SELF, handle, 0) == 0
+    os.close(handle)
+    return confined
+
+
+def _rules(path: str, closed: Collection[str]) -> Iterator[tuple[str, int]]:
+    """Yield what may be read under a path: all of it, or everything beside what is closed.
+
+    A rule holds for all that lies below, so the way to a closed folder is opened bit by bit.
+    """
+    inside = [place for place in closed if place.startswith(path + os.sep)]
+    if not os.path.isdir(path):
+        yield path, _READ_FILE
+    elif not inside:
+        yield path, _READ_FILE | _READ_DIR
+    else:
+        yield path, _READ_DIR
+        for entry in os.scandir(path):
+            # Where a link leads to is read, if it may be, by its own path.
+            if entry.path not in inside and not entry.is_symlink():
+                yield from _rules(entry.path, inside)
+
+
 def filters_system_calls() -> bool:
     """Return whether there is a seccomp filter for this system."""
     return sys.platform == "linux" and platform.machine() in _ARCH
@@ -118,11 +228,13 @@ def _filter_system_calls() -> bool:
     buffer = ctypes.create_string_buffer(program)
     # struct sock_fprog {unsigned short len; struct sock_filter *filter;}
     header = struct.pack("HL", len(program) // 8, ctypes.addressof(buffer))
+    return _prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, header)
+
+
+def _prctl(option: int, value: int, data: bytes | None = None) -> bool:
     prctl = ctypes.CDLL(None, use_errno=True).prctl
     prctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_char_p, ctypes.c_ulong, ctypes.c_ulong)
-    if prctl(_PR_SET_NO_NEW_PRIVS, 1, None, 0, 0) != 0:
-        return False
-    return prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, header, 0, 0) == 0
+    return prctl(option, value, data, 0, 0) == 0
 
 
 def _program(machine: str) -> bytes:
@@ -149,20 +261,20 @@ def _program(machine: str) -> bytes:
     return b"".join(struct.pack("HBBI", *instruction) for instruction in code)
 
 
-def _watch() -> None:
+def _watch(folders: Collection[str], closed: Collection[str]) -> None:
     """Refuse by name: changing anything, reading beyond Python's own files, and our own answers."""
     real = os.path.realpath
-    package = real(os.path.dirname(os.path.dirname(__file__))) + os.sep
-    places = {sys.prefix, sys.base_prefix, sys.exec_prefix, *sys.path} - {""}
-    roots = tuple(real(place) + os.sep for place in places)
-    single = ("/dev/null", "/dev/urandom", "/dev/random")
+    opened, shut = (tuple(f.rstrip(os.sep) + os.sep for f in part) for part in (folders, closed))
 
-    def readable(path: object) -> bool:
+    def may_read(path: object) -> bool:
         if not isinstance(path, str | bytes):
             return isinstance(path, int) or path is None
-        place = real(os.fsdecode(path))
-        inside = (place + os.sep).startswith(roots) and not place.startswith(package)
-        return inside or place in single
+        place = real(os.fsdecode(path)) + os.sep
+        nearest = [
+            max((len(folder) for folder in part if place.startswith(folder)), default=0)
+            for part in (opened, shut)
+        ]
+        return nearest[0] > nearest[1]
 
     def hook(event: str, arguments: tuple) -> None:
         if event in _REFUSED:
@@ -170,9 +282,9 @@ def _watch() -> None:
         if event == "open":
             path, mode, flags = arguments
             writes = (flags or 0) & WRITING if mode is None else set(str(mode)) & set("wax+")
-            if writes or not readable(path):
+            if writes or not may_read(path):
                 raise PermissionError(f"the grader does not allow opening {path!r:.200}")
-        elif event in ("os.listdir", "os.scandir") and not readable(arguments[0] or "."):
+        elif event in ("os.listdir", "os.scandir") and not may_read(arguments[0] or "."):
             raise PermissionError(f"the grader does not allow listing {arguments[0]!r:.200}")
 
     sys.addaudithook(hook)

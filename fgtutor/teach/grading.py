@@ -6,29 +6,28 @@ here, against answers worked out here. Hidden cases follow from the seed: there 
 """
 
 import json
-import os
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 
 import tyro
 from tqdm import tqdm
 
-from fgtutor.errors import ConfigError, NotebookError
+from fgtutor.errors import ConfigError, GradingError, NotebookError
+from fgtutor.machine import usable_cores
 from fgtutor.storage import atomic_write, check_writable, make_folder, write_json
 from fgtutor.teach.checks import EXERCISES, questions_of
 from fgtutor.teach.checks.question import CASES, Judge, plain_text
+from fgtutor.teach.confinement import WALLS
 from fgtutor.teach.marks import KEY, Mark, by_learner, gradescope, report, table
-from fgtutor.teach.sandbox import Limits, ask_submission
+from fgtutor.teach.sandbox import Limits, ask_submission, check_system
 from fgtutor.teach.values import encode
 
 LARGEST_NOTEBOOK = 20_000_000
 """Bytes; an exercise without outputs has ten thousand."""
-FULLY_CONFINED = "no new process"
-"""The protection that only a kernel with seccomp gives."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +49,7 @@ class GradeConfig:
     exercise: str = ""
     """Grade all as this exercise; default: what a notebook's metadata or file name says."""
     workers: int = 0
-    """Submissions side by side; 0 takes one per core."""
+    """Submissions side by side; 0 takes one per core that a container or affinity leaves us."""
     seconds: float = Limits.seconds
     """CPU time for all cases of a question, s."""
     loading: float = Limits.loading
@@ -92,23 +91,27 @@ def grade(config: GradeConfig, *, progress: bool = False) -> list[Mark]:
 
     Raises:
         ConfigError: A path does not exist or holds no notebook, or the system cannot grade.
+        MissingExtraError: IPython is not installed, in whose syntax cells are written.
     """
-    if sys.platform == "win32":
-        raise ConfigError(
-            "grading runs other people's code and needs the limits of Linux or macOS: use WSL"
-        )
+    check_system()
     submissions = find_notebooks(config.paths)
     read = [_read(path, config.exercise) for path in submissions]
     wanted = sorted({exercise for exercise, _, _ in read if exercise})
     examiners = {name: Examiner(name, config.seed, config.cases) for name in wanted}
     limits = Limits(seconds=config.seconds, loading=config.loading, memory_mb=config.memory_mb)
 
-    def one(number: int) -> Mark:
-        return _grade(submissions[number], *read[number], examiners, limits)
+    stop = Event()
 
-    with ThreadPoolExecutor(config.workers or os.cpu_count() or 1) as pool:
+    def one(number: int) -> Mark:
+        return _grade(submissions[number], *read[number], examiners, limits, stop)
+
+    with ThreadPoolExecutor(config.workers or usable_cores()) as pool:
         marks = pool.map(one, range(len(submissions)))
-        return list(tqdm(marks, total=len(submissions), unit="notebook", disable=not progress))
+        try:
+            return list(tqdm(marks, total=len(submissions), unit="notebook", disable=not progress))
+        except BaseException:  # Ctrl-C: the pool waits for what runs, so that ends now
+            stop.set()
+            raise
 
 
 def find_notebooks(paths: Sequence[Path]) -> list[Path]:
@@ -167,17 +170,22 @@ def _grade(
     fault: str,
     examiners: Mapping[str, Examiner],
     limits: Limits,
+    stop: Event,
 ) -> Mark:
     learner = learner_of(path)
     if fault:
         return Mark(path=path, learner=learner, exercise=exercise, fault=fault)
     examiner = examiners[exercise]
     try:
-        replies, in_force = ask_submission(cells, examiner.questions, limits)
+        replies, in_force = ask_submission(cells, examiner.questions, limits, stop)
         verdicts = tuple(judge.judge(replies[judge.question.id]) for judge in examiner.judges)
+    except GradingError as error:
+        fault = f"not graded: {error}"
+        return Mark(path=path, learner=learner, exercise=exercise, fault=fault, not_run=True)
     except Exception as error:  # one submission never stops the batch, not even by our mistake
         fault = f"the grader itself failed on it, look at it by hand: {error!r}"
-        return Mark(path=path, learner=learner, exercise=exercise, fault=plain_text(fault))
+        fault = plain_text(fault)
+        return Mark(path=path, learner=learner, exercise=exercise, fault=fault, not_run=True)
     return Mark(
         path=path,
         learner=learner,
@@ -214,9 +222,10 @@ def run(config: GradeConfig) -> int:
         for name, own in learners.items():
             safe = re.sub(r"[^\w-]+", "_", name)
             _write(config.reports / f"{safe}.txt", report(own))
-    if any(mark.in_force and FULLY_CONFINED not in mark.in_force for mark in marks):
-        print("This system cannot confine submissions fully; see docs/instructor.md.")
-    return 0
+    lacking = {wall for mark in marks if mark.in_force for wall in WALLS - {*mark.in_force}}
+    if lacking:
+        print(f"This system lacks: {', '.join(sorted(lacking))}; see docs/instructor.md.")
+    return int(any(mark.not_run for mark in marks))
 
 
 def _write(path: Path, text: str) -> None:

@@ -32,6 +32,8 @@ class Mark:
     """One a question, in order."""
     fault: str = ""
     """Why it could not be graded at all."""
+    not_run: bool = False
+    """Whether that is no fault of the submission: it is to be graded again."""
     in_force: tuple[str, ...] = ()
     """The protections under which it ran."""
 

@@ -6,14 +6,13 @@ an array by the time anything is compared.
 """
 
 import base64
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from fgtutor.errors import ConfigError
 
-LARGEST = 400_000
+LARGEST = 200_000
 """Most bytes of numbers in one answer."""
 DEEPEST = 4
 """Lists within lists in one answer: enough for any, and no recursion to exhaust."""
@@ -21,7 +20,7 @@ ROWS = 5
 """Differing values shown in a table."""
 PICTURE = 64, 20
 """Largest picture of where an array differs, columns and rows of text."""
-_DTYPES = {"b": "bool", "i": "int64", "u": "int64", "f": "float64"}
+_DTYPES = {"b": "bool", "i": "int64", "u": "uint64", "f": "float64"}
 
 
 def encode(value: Any, room: int = DEEPEST) -> Any:
@@ -33,6 +32,8 @@ def encode(value: Any, room: int = DEEPEST) -> Any:
             raise ConfigError(f"lists within lists, more than {DEEPEST} deep")
         kind = "tuple" if isinstance(value, tuple) else "list"
         return {kind: [encode(item, room - 1) for item in value]}
+    if isinstance(value, int):
+        raise ConfigError(f"{describe(value)}, more than 64")
     try:
         array = np.asarray(value)
     except Exception as error:  # whatever a foreign object's own conversion raises
@@ -52,14 +53,18 @@ def decode(data: Any, room: int = DEEPEST) -> Any:
         return data
     try:
         ((kind, content),) = data.items()
+        if not isinstance(content, list):
+            raise ValueError(f"{kind!r:.40} of no list")
         if kind in ("tuple", "list") and room:
             items = [decode(item, room - 1) for item in content]
             return tuple(items) if kind == "tuple" else items
         name, shape, text = content
         if kind != "array" or name not in _DTYPES.values():
             raise ValueError(f"neither a shallow list nor an array of numbers: {kind!r:.40}")
+        if any(type(length) is not int or length < 0 for length in shape):
+            raise ValueError(f"an array of shape {shape!r:.40}")
         return np.frombuffer(base64.b64decode(text), dtype=name).reshape(shape).copy()
-    except (AttributeError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
         raise ConfigError(f"not an encoded value ({error})") from error
 
 
@@ -72,7 +77,8 @@ def difference(
     holds only it. Without `show` the expected values stay secret.
     """
     if isinstance(expected, tuple):
-        items = list(got) if isinstance(got, Sequence) or np.ndim(got) else []
+        array = isinstance(got, np.ndarray) and got.ndim
+        items = list(got) if array or isinstance(got, tuple | list) else []
         if len(items) != len(expected):
             return f"Expected {len(expected)} values, got {describe(got)}."
         for i, (one, other) in enumerate(zip(expected, items, strict=True)):
@@ -81,16 +87,17 @@ def difference(
                 return f"In value {i + 1} of the {len(expected)} returned:\n{text}"
         return ""
     wanted, array = np.asarray(expected), _numbers(got)
+    asked = describe(expected) if show or wanted.ndim else "a number"
     if got is None:
         return "The function returned None: does it end with `return`?"
     if array is None:
-        return f"Expected {describe(expected)}, got {describe(got)}."
+        return f"Expected {asked}, got {describe(got)}."
     if wanted.ndim == 0 and array.size == 1:
         array = array.reshape(())
     if array.shape != wanted.shape:
         turned = sorted(array.shape) == sorted(wanted.shape)
         advice = ": are two axes swapped?" if turned else "."
-        return f"Expected {describe(expected)}, got {describe(got)}{advice}"
+        return f"Expected {asked}, got {describe(got)}{advice}"
     wrong = ~np.isclose(array, wanted, rtol=rtol, atol=atol, equal_nan=True)
     if not wrong.any():
         return ""
@@ -108,6 +115,8 @@ def describe(value: Any) -> str:
         return f"{len(value)} values ({inside})" if value else "an empty list"
     if isinstance(value, str):
         return f"the text {value[:40]!r}"
+    if isinstance(value, int) and not _is_plain(value):
+        return f"an integer of {value.bit_length()} bits"
     if isinstance(value, bool | int | float | np.generic):
         return f"the number {_number(value)}"
     return _kind(value)
@@ -126,11 +135,21 @@ def _kind(value: Any) -> str:
 
 def _numbers(value: Any) -> np.ndarray | None:
     """Return a value as an array of numbers, or None if it is not one."""
+    if not _is_numeric(value):  # with a text among them, numpy would make all as wide as that
+        return None
     try:
-        array = np.asarray(value)
+        return np.asarray(value)
     except ValueError:  # rows of different lengths
         return None
-    return array if array.dtype.kind in _DTYPES else None
+
+
+def _is_numeric(value: Any) -> bool:
+    """Return whether a value consists of numbers, each of which numpy holds in 8 bytes."""
+    if isinstance(value, tuple | list):
+        return all(map(_is_numeric, value))
+    if isinstance(value, np.ndarray | np.generic):
+        return value.dtype.kind in _DTYPES
+    return isinstance(value, int | float) and _is_plain(value)
 
 
 def _number(value: Any, digits: int = 4) -> str:

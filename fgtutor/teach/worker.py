@@ -8,12 +8,14 @@ import importlib
 import json
 import linecache
 import os
+import re
 import sys
 import time
 import types
 from typing import Any, BinaryIO
 
 from fgtutor.teach.asking import CRASHED, NOT_STARTED, TOO_SLOW, TooSlow, ask, explain, time_limit
+from fgtutor.teach.cells import Cells
 from fgtutor.teach.confinement import confine
 from fgtutor.teach.values import decode
 
@@ -28,28 +30,32 @@ def main() -> None:
     null = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(null, stream)
-    seconds, loading = job["seconds"], job["loading"]
     for name in OFFERED:  # before the door closes
         importlib.import_module(name)
+    sys.path.remove(sys.argv.pop())
     in_force = confine(
-        memory_mb=job["memory_mb"],
-        cpu_seconds=loading + len(job["questions"]) * (seconds + 1) + 1,
+        grader=job["grader"], memory_mb=job["memory_mb"], cpu_seconds=job["cpu_seconds"]
     )
     send(answers, {"confined": in_force})
-    namespace, faults = load(job["cells"], loading)
+    namespace, faults = load(job["cells"], job["loading"])
     send(answers, {"loaded": True})
     for question in job["questions"]:
         cases = question["cases"]
         arguments = None if cases is None else [decode(case) for case in cases]
-        reply = answer(namespace, faults, question["name"], arguments, seconds)
-        send(answers, {"question": question["id"], **reply})
+        reply = answer(namespace, faults, question["name"], arguments, job["seconds"])
+        if not send(answers, {"question": question["id"], **reply}, job["longest_line"]):
+            detail = "the answers together are larger than any should be"
+            send(answers, {"question": question["id"], "outcome": CRASHED, "detail": detail})
     os._exit(0)
 
 
-def send(answers: BinaryIO, message: dict[str, Any]) -> None:
-    """Write one line."""
-    answers.write(json.dumps(message).encode() + b"\n")
-    answers.flush()
+def send(answers: BinaryIO, message: dict[str, Any], longest: int = 10**6) -> bool:
+    """Write one line, unless it is longer than the grader reads; return whether it was written."""
+    line = json.dumps(message).encode() + b"\n"
+    if len(line) <= longest:
+        answers.write(line)
+        answers.flush()
+    return len(line) <= longest
 
 
 def load(cells: list[str], seconds: float) -> tuple[dict[str, Any], list[tuple[str, dict]]]:
@@ -61,31 +67,26 @@ def load(cells: list[str], seconds: float) -> tuple[dict[str, Any], list[tuple[s
     module = types.ModuleType("__main__")
     module.__dict__["display"] = lambda *values, **options: None
     sys.modules["__main__"] = module
+    notebook = Cells(module.__dict__)
     faults = []
-    end = time.process_time() + seconds
+    left = seconds
     for number, source in enumerate(cells):
         name = f"<cell {number + 1}>"
         linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
+        begun = time.process_time()
         try:
-            with time_limit(max(end - time.process_time(), 0.2)):
-                exec(compiled(source, name), module.__dict__)
+            code = notebook.compiled(source, name)
+            begun = time.process_time()  # that IPython is loaded for it is not the cell's time
+            with time_limit(max(left, 0.2), patience=0):
+                notebook.run(code)
         except TooSlow:
             detail = f"cell {number + 1} runs on and on, and was stopped"
             faults.append((source, {"outcome": TOO_SLOW, "detail": detail}))
         except BaseException as error:
             detail = f"cell {number + 1}: {explain(error, name)}"
             faults.append((source, {"outcome": CRASHED, "detail": detail}))
+        left -= time.process_time() - begun
     return module.__dict__, faults
-
-
-def compiled(source: str, name: str) -> types.CodeType:
-    """Compile a cell, without the lines that only IPython understands (%magic and !command)."""
-    try:
-        return compile(source, name, "exec")
-    except SyntaxError:
-        lines = source.splitlines()
-        kept = ["" if line.lstrip().startswith(("%", "!")) else line for line in lines]
-        return compile("\n".join(kept), name, "exec")
 
 
 def stub_checks() -> None:
@@ -105,11 +106,16 @@ def answer(
 ) -> dict[str, Any]:
     """Ask one question; where the name is missing, say which failing cell should have given it."""
     if name not in namespace:
+        gives = re.compile(
+            rf"^ *(?:async )?(?:(?:def|class) {name}\b|(?:from|import) .*\b{name}\b"
+            rf"|(?:\w+, *)*{name}\b[^()\n=]*=(?!=))",
+            re.MULTILINE,
+        )
         for source, reply in faults:
-            if name in source:
+            if gives.search(source):
                 return reply
         return {"outcome": NOT_STARTED, "detail": f"the notebook defines no `{name}`"}
     try:
-        return ask(namespace[name], cases, seconds)
+        return ask(namespace[name], cases, seconds, patience=0)
     except BaseException as error:  # whatever a submission raises to get out of here
         return {"outcome": CRASHED, "detail": type(error).__name__}

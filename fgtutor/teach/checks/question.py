@@ -10,13 +10,14 @@ import inspect
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from fgtutor.errors import ConfigError
 from fgtutor.teach.asking import CRASHED, NOT_STARTED, TOO_SLOW
 from fgtutor.teach.values import decode, describe, difference
+from fgtutor.validation import CountOrZero, parse_record
 
 PASSED, WRONG = "passed", "wrong"
 OUTCOMES: tuple[str, ...] = (PASSED, NOT_STARTED, WRONG, CRASHED, TOO_SLOW)
@@ -80,6 +81,22 @@ class Question:
         return [*self.examples, *(self.draw(dice) for _ in range(count))]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Reply:
+    """What `asking.ask` gives, and what a submission may forge."""
+
+    question: str = ""
+    """Its id, where several are asked."""
+    outcome: Literal["not started", "crashed", "too slow"] | None = None
+    """Why there are no answers."""
+    detail: str = ""
+    """The same in words."""
+    changed: CountOrZero | None = None
+    """Which of its arguments the function changed."""
+    answers: list[Any] | None = None
+    """An encoded answer to every case."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """What became of one answer."""
@@ -111,15 +128,15 @@ class Judge:
 
     def judge(self, reply: Mapping[str, Any]) -> Verdict:
         """Turn a reply of `asking.ask`, which may be forged or broken, into a verdict."""
-        outcome = reply.get("outcome")
-        if outcome in (NOT_STARTED, CRASHED, TOO_SLOW):
-            return Verdict(self.question, outcome, plain_text(reply.get("detail", "")))
-        if "changed" in reply:
-            return Verdict(self.question, WRONG, self._changed(reply["changed"]))
         try:
-            answers = [decode(answer) for answer in reply["answers"]]
-        except (ConfigError, KeyError, TypeError) as error:
+            said = parse_record(Reply, reply, ConfigError, "the reply")
+            answers = [decode(answer) for answer in said.answers or []]
+        except ConfigError as error:
             return Verdict(self.question, CRASHED, plain_text(f"unreadable answer: {error}"))
+        if said.outcome:
+            return Verdict(self.question, said.outcome, plain_text(said.detail))
+        if said.changed is not None:
+            return Verdict(self.question, WRONG, self._changed(said.changed))
         if len(answers) != len(self.right):
             return Verdict(self.question, CRASHED, f"{len(answers)} answers to {len(self.right)}")
         for number, (expected, got) in enumerate(zip(self.right, answers, strict=True)):
@@ -147,9 +164,9 @@ class Judge:
             lines.append(f"In case {number + 1} of {len(self.cases)}, with {given}:")
         return plain_text("\n".join([*lines, text]))
 
-    def _changed(self, place: Any) -> str:
+    def _changed(self, place: int) -> str:
         names = list(inspect.signature(self.question.truth).parameters)
-        name = names[place] if place in range(len(names)) else "?"
+        name = names[place] if place < len(names) else "?"
         return (
             f"Expected: {self.question.expects}\n"
             f"The function changes its argument `{name}`, which belongs to the caller: work on a "

@@ -1,0 +1,458 @@
+"""A submission's process: what it cannot read, and that only its own doings count against it."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fgtutor.errors import ConfigError, GradingError
+from fgtutor.teach import grading, sandbox
+from fgtutor.teach.asking import CRASHED, NOT_STARTED, TOO_SLOW
+from fgtutor.teach.confinement import WALLS, landlock_version
+from fgtutor.teach.grading import GradeConfig, grade
+from fgtutor.teach.marks import table
+from fgtutor.teach.sandbox import Limits, ask_submission
+from fgtutor.teach.values import decode, encode
+from tests.test_grading import HONEST, QUICK, submit
+
+CLONE = Path(__file__).resolve().parents[1]
+SHORT = Limits(seconds=0.5, idle=0.5)
+"""Limits under which a sleeper does not hold up the tests."""
+DISARM = """
+import gc, types
+for thing in gc.get_objects():
+    if type(thing) is types.FunctionType and thing.__qualname__ == "_watch.<locals>.hook":
+        for cell in thing.__closure__:
+            cell.cell_contents = lambda path: True
+        thing.__globals__.update(WRITING=0, _REFUSED=frozenset())
+"""
+"""Takes the audit hook away, as anybody can who shares a process with it."""
+OPEN = """
+import ctypes, io, mmap, os, pathlib, linecache, numpy
+def by_ctypes(path):
+    libc = ctypes.CDLL(None, use_errno=True)
+    number = libc.open(os.fsencode(path), 0)
+    if number < 0:
+        raise OSError(ctypes.get_errno(), "by ctypes")
+    return os.read(number, 9)
+WAYS = {
+    "open": lambda path: open(path, "rb").read(9),
+    "os.open": lambda path: os.read(os.open(path, 0), 9),
+    "FileIO": lambda path: io.FileIO(path).read(9),
+    "open_code": lambda path: io.open_code(path).read(9),
+    "pathlib": lambda path: pathlib.Path(path).read_bytes(),
+    "numpy": lambda path: numpy.fromfile(path, numpy.uint8, 9).tobytes(),
+    "os.path": lambda path: open(os.path.join("/proc/self/root", path[1:]), "rb").read(9),
+    "relative": lambda path: open("./" + path[1:], "rb").read(9),
+    "ctypes": by_ctypes,
+}
+def tried(paths):
+    got = []
+    for path in paths:
+        for way, take in WAYS.items():
+            try:
+                got.append([path, way, take(path).hex()])
+            except OSError as error:
+                got.append([path, way, error.errno or 0])
+    return got
+def listed(paths):
+    got = []
+    for path in paths:
+        try:
+            got.append([path, *os.listdir(path)])
+        except OSError as error:
+            got.append([path, error.errno or 0])
+    return got
+"""
+EACCES = 13
+walled = pytest.mark.skipif(not landlock_version(), reason="no Landlock in this kernel")
+
+
+def asked(cells: list[str], limits: Limits = SHORT, **functions: tuple | None) -> dict[str, dict]:
+    """Ask for functions by name, each for one case; None asks for a value."""
+    questions = [
+        {"id": name, "name": name, "cases": None if case is None else [encode(case)]}
+        for name, case in functions.items()
+    ]
+    replies, in_force = ask_submission(cells, questions, limits)
+    assert {"memory limited", *(WALLS if landlock_version() else ())} <= {*in_force}
+    return replies
+
+
+def children(parent: int) -> Iterator[int]:
+    """Yield the processes that a process has started."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            text = stat.read_text()
+        except OSError:  # it has just ended
+            continue
+        if int(text.rpartition(")")[2].split()[1]) == parent:
+            yield int(stat.parent.name)
+
+
+def until(happens, seconds: float = 60.0):
+    """Wait for something to be true, and return it."""
+    end = time.monotonic() + seconds
+    while not (value := happens()):
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.05)
+    return value
+
+
+# What it cannot read ------------------------------------------------------------------------------
+
+
+@walled
+@pytest.mark.parametrize("hook", ["", DISARM], ids=["with the hook", "without the hook"])
+def test_the_kernel_opens_no_answer_no_hand_in_and_no_secret(tmp_path, hook):
+    """Without the hook it is the kernel that answers EACCES; with it, the hook comes first."""
+    submit(tmp_path, "bob", *HONEST)
+    (tmp_path / "marks.csv").write_text("bob,6")
+    (tmp_path / "link.py").symlink_to(CLONE / "solutions" / "src" / "ex10.py")
+    closed = [
+        *(CLONE / "solutions").rglob("ex10.*"),
+        *(CLONE / "fgtutor/teach/checks").glob("*.*"),
+        *(CLONE / "fgtutor/evaluation").glob("metrics.py"),
+        CLONE / "pyproject.toml",
+        *tmp_path.iterdir(),
+        *(Path("/proc", str(os.getpid()), name) for name in ("cmdline", "environ", "maps", "mem")),
+        *(Path("/proc/self", name) for name in ("cmdline", "maps", "mem", "environ")),
+        Path("/etc/passwd"),
+        Path("/etc/shadow"),
+    ]
+    assert len(closed) > 25
+    folders = [CLONE, CLONE / "solutions", CLONE / "fgtutor/teach/checks", tmp_path, "/", "/proc"]
+    opened, lists = [*map(str, closed), np_file()], [*map(str, folders)]
+    replies = asked([OPEN, hook], tried=(opened,), listed=(lists,))
+    (got,), (seen,) = (map(decode, replies[name]["answers"]) for name in ("tried", "listed"))
+    taken = [entry for entry in got if isinstance(entry[2], str)]
+    # What is Python's own is opened, so the ways of opening work.
+    assert {entry[0] for entry in taken} == {np_file()} and len(taken) >= 7
+    # The hook's own errors have no number.
+    assert {entry[2] for entry in got if entry[0] != np_file()} == {EACCES if hook else 0}
+    assert [entry[1:] for entry in seen] == [[EACCES if hook else 0]] * len(folders)
+
+
+def np_file() -> str:
+    """A file that any submission may read."""
+    import numpy
+
+    return str(numpy.__file__)
+
+
+@walled
+def test_our_package_is_closed_also_where_it_is_installed_among_others(tmp_path):
+    packages = tmp_path / "lib" / "python3.11" / "site-packages"
+    for name in ("numpy/a.py", "fgtutor/teach/checks/ex01.py", "single.py"):
+        (packages / name).parent.mkdir(parents=True, exist_ok=True)
+        (packages / name).write_text(name)
+    (packages / "other").symlink_to(packages / "fgtutor")
+    (packages / "~gtutor").symlink_to(packages / "numpy")
+    code = (
+        "import os, sys\nfrom fgtutor.teach import confinement as c\n"
+        f"root, packages = {str(tmp_path / 'lib')!r}, {str(packages)!r}\n"
+        "sys.path.append(packages)\n"
+        "folders, closed = c.readable()\n"
+        "assert packages in folders and packages + '/fgtutor' in closed\n"
+        "assert c._prctl(38, 1) and c._wall_off_files([*folders, root], closed)\n"
+        "for name in ('numpy/a.py', 'single.py', 'fgtutor/teach/checks/ex01.py',\n"
+        "             'other/teach/checks/ex01.py'):\n"
+        "    try: print(open(os.path.join(packages, name)).read())\n"
+        "    except PermissionError: print('closed')\n"
+        "print(len(os.listdir(packages)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["numpy/a.py", "single.py", "closed", "closed", "5"]
+
+
+THIEVES = {
+    "the worked solution": """
+import sys
+for root in [*sys.path, {clone!r}]:
+    try:
+        text = open(root + "/solutions/src/ex10.py").read()
+        exec(compile(text.replace("check(", "(lambda *a, **k: None)("), "s", "exec"))
+    except Exception:
+        pass
+""",
+    "another hand-in": """
+import glob, json, sys
+for root in [*sys.path, {clone!r}, {folder!r}]:
+    try:
+        for path in glob.glob(root + "/**/*ada*", recursive=True) + [{folder!r} + "/ada.ipynb"]:
+            for cell in json.load(open(path))["cells"]:
+                exec("".join(cell["source"]))
+    except Exception:
+        pass
+""",
+    "the marks": """
+def path_length(xy):
+    raise ValueError(open({folder!r} + "/marks.csv").read())
+""",
+    "the seed": """
+import os
+def path_length(xy):
+    raise ValueError(open(f"/proc/{{os.getppid()}}/cmdline").read())
+""",
+    "the course's checks": """
+import importlib, sys
+for name in ("fgtutor.teach.checks", "fgtutor.teach.checks.ex10"):
+    sys.modules.pop(name, None)
+sys.meta_path[:] = [finder for finder in sys.meta_path if type(finder).__name__ != "_Offered"]
+sys.path.append({clone!r})
+importlib.invalidate_caches()
+try:
+    import fgtutor.teach.checks.ex10 as answers
+    path_length, spl, reference_length = [question.truth for question in answers.QUESTIONS]
+except Exception:
+    pass
+""",
+}
+
+
+@pytest.mark.slow
+def test_no_thief_scores_or_reports_what_he_took(tmp_path):
+    folder = tmp_path / "class"
+    submit(folder, "ada", *HONEST)
+    (folder / "marks.csv").write_text("ada,hunter2")
+    for name, code in THIEVES.items():
+        text = code.format(clone=str(CLONE), folder=str(folder))
+        submit(folder, name, text)
+        if landlock_version():
+            submit(folder, f"{name}, disarmed", DISARM, text)
+    config = GradeConfig(paths=(folder,), **QUICK | {"seed": 20417, "loading": 2.0})
+    marks = {mark.learner: mark for mark in grade(config)}
+    assert {name: mark.points for name, mark in marks.items() if mark.points} == {"ada": 6}
+    assert not any(mark.fault for mark in marks.values())
+    texts = [verdict.detail for mark in marks.values() for verdict in mark.verdicts]
+    assert not any("hunter2" in text or "test_sandbox" in text for text in texts)
+
+
+def test_the_code_of_the_current_folder_does_not_run(tmp_path, monkeypatch):
+    for name in ("numpy", "json", "random", "IPython", "fgtutor", "sitecustomize"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('ran the wrong file')")
+    monkeypatch.chdir(tmp_path)
+    cell = "import numpy, random\n%matplotlib inline\ndef f(k): return k + 1"
+    assert asked([cell], f=(2,))["f"]["answers"] == [3]
+
+
+# What counts against it ---------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_late_start_costs_nothing(monkeypatch):
+    monkeypatch.setattr(sandbox, "START", f"import time; time.sleep(2)\n{sandbox.START}")
+    assert asked(["def f(k): return k + 1"], f=(2,))["f"]["answers"] == [3]
+
+
+@pytest.mark.slow
+def test_a_start_that_fails_is_tried_again(monkeypatch, tmp_path):
+    flaky = (
+        f"import os\nonce = {str(tmp_path / 'once')!r}\n"
+        "if not os.path.exists(once):\n    os.mkdir(once)\n    os._exit(7)\n"
+    )
+    monkeypatch.setattr(sandbox, "START", flaky + sandbox.START)
+    assert asked(["def f(k): return k + 1"], f=(2,))["f"]["answers"] == [3]
+
+
+@pytest.mark.slow
+def test_a_submission_that_could_not_be_run_is_a_fault_and_an_error(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sandbox, "START", "raise SystemExit(7)")
+    monkeypatch.setattr(sandbox, "TRIES", 2)
+    config = GradeConfig(paths=(submit(tmp_path, "ada", *HONEST),), csv=tmp_path / "m.csv", **QUICK)
+    (mark,) = grade(config)
+    assert "could not be started (ended with code 7)" in mark.fault and mark.not_run
+    assert "ended with code 7" in table([mark])
+    assert grading.run(config) != 0
+    assert "grade it again" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_machine_too_busy_is_a_fault_of_nobody(monkeypatch):
+    monkeypatch.setattr(sandbox, "LONGEST_WAIT", 1.0)
+    cell = "def f(k):\n    while True: pass"
+    with pytest.raises(GradingError, match="too busy"):
+        asked([cell], Limits(seconds=60), f=(2,))
+
+
+@pytest.mark.slow
+def test_a_process_killed_from_outside_is_no_crash_of_its_own():
+    def kill() -> None:
+        time.sleep(1)
+        (worker,) = until(lambda: [*children(os.getpid())])
+        os.kill(worker, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    with pytest.raises(GradingError, match="killed from outside"):
+        asked(["def f(k):\n    while True: pass"], Limits(seconds=60), f=(2,))
+    killer.join()
+
+
+@pytest.mark.slow
+def test_sleep_is_limited_for_a_question_and_in_all():
+    cells = ["import time\ndef a(k): time.sleep(999)\ndef b(k): return k\nc = d = e = a"]
+    replies = asked(cells, a=(1,), b=(1,), c=(1,), d=(1,), e=(1,))
+    assert [replies[name].get("outcome") for name in "acde"] == [TOO_SLOW] * 4
+    assert replies["b"]["answers"] == [1]
+
+
+@pytest.mark.slow
+def test_a_sleeper_gains_no_time_by_dripping():
+    drip = """
+import os, time
+def f(k):
+    while True:
+        for number in range(3, 64):
+            try: os.write(number, b" ")
+            except OSError: pass
+        time.sleep(0.02)
+"""
+    assert asked([drip], f=(1,))["f"]["outcome"] == TOO_SLOW
+
+
+@pytest.mark.slow
+def test_stopping_ends_what_runs():
+    stop = threading.Event()
+    timer = threading.Timer(1.0, stop.set)
+    timer.start()
+    question = {"id": "f", "name": "f", "cases": [encode((1,))]}
+    with pytest.raises(GradingError, match="stopped"):
+        ask_submission(["import time\ntime.sleep(3000)"], [question], Limits(idle=3600), stop)
+    timer.join()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.slow
+def test_nothing_outlives_the_grader(tmp_path, how):
+    path = submit(tmp_path, "ada", "import time\nwhile True: time.sleep(999)")
+    code = (
+        "import signal\nfrom pathlib import Path\nfrom fgtutor.teach.grading import *\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"grade(GradeConfig(paths=(Path({str(path)!r}),)))\n"
+    )
+    # A folder that is empty before and after shows that nothing temporary is left.
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    with subprocess.Popen(
+        [sys.executable, "-P", "-c", code], env=environment, stderr=subprocess.DEVNULL
+    ) as grader:
+        (worker,) = until(lambda: [*children(grader.pid)])
+        until(lambda: Path(f"/proc/{worker}/wchan").exists() and asleep(worker))
+        grader.send_signal(how)
+        grader.wait(timeout=60)
+    until(lambda: not Path(f"/proc/{worker}").exists() or zombie(worker))
+    assert [*temporary.iterdir()] == []
+
+
+def asleep(pid: int) -> bool:
+    text = Path(f"/proc/{pid}/status").read_text()
+    return "State:\tS" in text and "Seccomp:\t2" in text
+
+
+def zombie(pid: int) -> bool:
+    try:
+        return "State:\tZ" in Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return True
+
+
+# What it says -------------------------------------------------------------------------------------
+
+
+FORGED = (
+    '{"question": "ex10.q1", "changed": 0.0}',
+    '{"question": "ex10.q1", "changed": "xy"}',
+    '{"question": "ex10.q1", "answers": {"0": 1}}',
+    '{"question": "ex10.q1", "answers": [1e999, NaN]}',
+    '{"question": "ex10.q1", "outcome": "passed", "points": 100}',
+    '{"question": "ex10.q1", "outcome": null, "detail": null, "answers": null}',
+    '{"question": "ex10.q1", "late": true}',
+    '{"question": ["ex10.q1"]}',
+    "[" * 100_000,
+    "7" * 100_000,
+    "null",
+)
+
+
+@pytest.mark.slow
+def test_whatever_a_submission_says_is_a_mark(tmp_path):
+    for number, line in enumerate(FORGED):
+        cell = (
+            f"import os\nline = {line!r}.encode() + b'\\n'\n"
+            "def path_length(xy):\n    for number in range(3, 64):\n"
+            "        try: os.write(number, line)\n        except OSError: pass\n    os._exit(0)\n"
+        )
+        submit(tmp_path, f"forger{number}", cell)
+    marks = grade(GradeConfig(paths=(tmp_path,), **QUICK))
+    assert len(marks) == len(FORGED)
+    for mark in marks:
+        assert (mark.points, mark.fault) == (0, "")
+        assert mark.verdicts[0].outcome == CRASHED
+
+
+def test_answers_larger_than_any_are_named_so():
+    cells = [
+        "def a(): return [0.0] * 300_000\ndef b(): return 'x' * 10**7\ndef c(): return 10**4000",
+        "import numpy\ndef d(): return numpy.zeros(10**6)\ndef e(): return [[[[[1]]]]]",
+    ]
+    replies = asked(cells, a=(), b=(), c=(), d=(), e=())
+    assert [reply["outcome"] for reply in replies.values()] == [CRASHED] * 5
+    details = [replies[name]["detail"] for name in "abcde"]
+    assert all("larger than any" in details[place] for place in (0, 1, 3))
+    assert "13288 bits" in details[2] and "4 deep" in details[4]
+
+
+def test_a_renamed_function_is_not_defined_rather_than_crashed():
+    cells = ["def Fuse(k): return k", 'check("ex05.q1", fuse)', "print(fuse(3), fuse == 3)"]
+    reply = asked(cells, fuse=(1,))["fuse"]
+    assert (reply["outcome"], reply["detail"]) == (NOT_STARTED, "the notebook defines no `fuse`")
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [
+        "def fuse(k) return k",
+        "1 / 0\nfuse = 3",
+        "1 / 0\nother, fuse = 3, 4",
+        "1 / 0\nfuse: int = 3",
+        "1 / 0\nclass fuse: pass",
+        "1 / 0\nasync def fuse(): pass",
+        "from nowhere import other, fuse",
+    ],
+)
+def test_a_cell_that_should_have_defined_it_is_blamed(cell):
+    assert asked([cell], fuse=(1,))["fuse"]["detail"].startswith("cell 1: ")
+
+
+@pytest.mark.slow
+def test_what_learners_import_can_be_imported_without_a_home_of_their_own():
+    cell = "import matplotlib.pyplot as plt\nplt.plot([1, 2])\nimport scipy.sparse, networkx\nx = 1"
+    assert asked([cell], Limits(), x=None)["x"]["answers"] == [1]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"seconds": float("inf")},
+        {"seconds": float("nan")},
+        {"seconds": 0.0},
+        {"loading": 1e300},
+        {"loading": -1.0},
+        {"memory_mb": 10},
+        {"memory_mb": 10**12},
+        {"idle": float("inf")},
+    ],
+)
+def test_limits_without_sense_are_refused_before_anything_runs(fields):
+    (name,) = fields
+    with pytest.raises(ConfigError, match=name):
+        Limits(**fields)
