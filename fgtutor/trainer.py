@@ -146,16 +146,12 @@ class Trainer:
             group["lr"] = self.config.feasibility_learning_rate * 0.05**done
         try:
             self.runner.learn(1)
-        except ValueError as error:  # torch, rsl_rl or MuJoCo met something that is no number
-            raise self._diverged(str(error).splitlines()[0]) from error
-        nets = {
-            "policy": self.algorithm.get_policy(),
-            "critic": self.algorithm.critic,
-            "Feasibility-Net": self.algorithm.feasibility,
-        }
-        for name, net in nets.items():
-            if not all(value.isfinite().all() for value in net.state_dict().values()):
-                raise self._diverged(f"weights of the {name} are not finite")
+        except (RuntimeError, ValueError) as error:
+            self._check_weights()
+            if isinstance(error, ValueError):  # rsl_rl or MuJoCo met something that is no number
+                raise self._diverged(str(error).splitlines()[0]) from error
+            raise
+        self._check_weights()
         self._quieten()
         self.iteration += 1
         self.seconds += time.monotonic() - began
@@ -176,6 +172,17 @@ class Trainer:
             raise self._diverged(f"{', '.join(strange)} not finite")
         self.history.append(row)
         return row
+
+    def _check_weights(self) -> None:
+        """Raise `DivergedError` if a weight of any network is not finite."""
+        nets = {
+            "policy": self.algorithm.get_policy(),
+            "critic": self.algorithm.critic,
+            "Feasibility-Net": self.algorithm.feasibility,
+        }
+        for name, net in nets.items():
+            if not all(value.isfinite().all() for value in net.state_dict().values()):
+                raise self._diverged(f"weights of the {name} are not finite")
 
     def _diverged(self, what: str) -> DivergedError:
         how = "--learning-rate, or --feasibility-learning-rate or --context-learning-rate"

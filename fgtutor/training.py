@@ -20,6 +20,7 @@ from fgtutor import distributed
 from fgtutor.distributed import leads
 from fgtutor.errors import CheckpointError
 from fgtutor.recipe import A1TrainConfig, TrainConfig, config_of, training_world
+from fgtutor.robots import env_class
 from fgtutor.specialist import Specialist, save_specialist
 from fgtutor.storage import locked_folder, storage_error
 from fgtutor.trainer import CHECKPOINT, Trainer
@@ -63,7 +64,7 @@ def _train(
     attended: bool = True,
 ) -> tuple[Specialist, bool]:
     """Train as `train` says; return the specialist, and whether a Ctrl-C ended it."""
-    # An unknown robot or terrain fails before there is a folder.
+    env_class(config.robot)  # an unknown robot or terrain fails before there is a folder
     training_world(replace(config, rows=1, columns=1))
     with (
         locked_folder(config.folder) if leads() else contextlib.nullcontext(),
