@@ -23,7 +23,7 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import Tensor
 
-from fgtutor.errors import ExportError, SpecialistError
+from fgtutor.errors import ConfigError, ExportError, SpecialistError
 from fgtutor.patches import HOLE_DEPTH, SPACING
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
@@ -66,12 +66,16 @@ def export_policy(specialist: Specialist, path: str | Path) -> float:
     """Write the policy to `path` and its description beside it; return the difference to torch.
 
     Raises:
+        ConfigError: The path does not end in .onnx.
         SpecialistError: The policy does not read what its robot observes.
-        ExportError: The exported network answers differently.
+        ExportError: The network cannot be exported, or answers differently.
         StorageError: The system refused to write; nothing partial is left.
     """
     path = Path(path)
+    if path.suffix != ".onnx":  # .json, for one, would be overwritten by the description
+        raise ConfigError(f"the file for the policy ends in .onnx, got {path.name!r}")
     check_writable(path)
+    check_writable(path.with_suffix(".json"))
     description = describe(specialist)
     model = to_onnx(specialist.policy)
     model.metadata_props.add(key=METADATA, value=json.dumps(description))
@@ -83,20 +87,29 @@ def export_policy(specialist: Specialist, path: str | Path) -> float:
 
 
 def to_onnx(policy: MLPModel) -> onnx.ModelProto:
-    """Return the policy's deterministic answer as an ONNX graph: observation -> action."""
+    """Return the policy's deterministic answer as an ONNX graph: observation -> action.
+
+    Raises:
+        ExportError: The network does something that ONNX cannot express.
+    """
     module = policy.as_onnx(verbose=False).eval()
     example = torch.zeros(2, policy.obs_dim)  # one row would make the batch a constant
-    with _quiet():
-        program = torch.onnx.export(
-            module,
-            (example,),
-            dynamo=True,
-            verbose=False,
-            opset_version=OPSET,
-            input_names=["observation"],
-            output_names=["action"],
-            dynamic_shapes=({0: torch.export.Dim("batch")},),
-        )
+    try:
+        with _quiet():
+            program = torch.onnx.export(
+                module,
+                (example,),
+                dynamo=True,
+                verbose=False,
+                opset_version=OPSET,
+                input_names=["observation"],
+                output_names=["action"],
+                dynamic_shapes=({0: torch.export.Dim("batch")},),
+            )
+    except Exception as error:  # a policy class of somebody else's may do what ONNX cannot
+        raise ExportError(
+            f"a {type(policy).__name__} cannot be written as ONNX: {error!s:.300}"
+        ) from error
     if program is None:
         raise ExportError("torch exported no program: install the torch of constraints.txt")
     model = program.model_proto

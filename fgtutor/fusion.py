@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from fgtutor.directions import NUM_HEADINGS
 from fgtutor.errors import PlanningError
 
 Array = TypeVar("Array", Tensor, np.ndarray)
@@ -23,22 +24,35 @@ def fuse(
     """Return F_max = max_i F_i and P = argmax_i F_i; on a tie the first specialist is taken.
 
     The answer is of the kind of the first tensor, torch or numpy; P is int64. Raises
-    `PlanningError` if there is no tensor, if shapes differ, or if a value is not finite.
+    `PlanningError` if there is no tensor, if shapes differ or are no maps of 8 headings, or if a
+    value is no feasibility from 0 to 1.
     """
     if len(tensors) == 0:
         raise PlanningError(
             "fuse needs at least one feasibility tensor, got none: add a specialist"
         )
-    arrays = [np.asarray(tensor) for tensor in tensors]
+    arrays = [np.asarray(t.detach().cpu() if isinstance(t, Tensor) else t) for t in tensors]
+    if arrays[0].ndim != 3 or arrays[0].shape[-1] != NUM_HEADINGS or not arrays[0].size:
+        raise PlanningError(
+            f"tensor 0 has shape {arrays[0].shape}, expected (nx, ny, {NUM_HEADINGS}): pass what "
+            "tensorize gave"
+        )
     for index, array in enumerate(arrays):
         if array.shape != arrays[0].shape:
             raise PlanningError(
                 f"tensor {index} has shape {array.shape}, the first has {arrays[0].shape}: "
                 "tensorize every specialist on the same map"
             )
+        if array.dtype.kind not in "fiub":
+            raise PlanningError(f"tensor {index} holds {array.dtype}, expected numbers")
         if not np.isfinite(array).all():
             raise PlanningError(
                 f"tensor {index} holds NaN or infinity: check that specialist's Feasibility-Net"
+            )
+        if array.min() < 0 or array.max() > 1:
+            raise PlanningError(
+                f"tensor {index} holds {array.min()} to {array.max()}, a feasibility lies between "
+                "0 and 1: check what was multiplied into it"
             )
     stacked = np.stack(arrays)
     policy_map = stacked.argmax(axis=0)

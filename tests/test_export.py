@@ -9,11 +9,13 @@ import onnx
 import pytest
 import torch
 from onnx.reference import ReferenceEvaluator
+from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
+from tensordict import TensorDict
 
 from fgtutor import export
 from fgtutor.dreamwaq import DreamWaQModel
-from fgtutor.errors import ExportError, SpecialistError, StorageError
+from fgtutor.errors import ConfigError, ExportError, SpecialistError, StorageError
 from fgtutor.patches import prepare
 from fgtutor.robots.a1 import A1_GRID, A1Env
 from fgtutor.specialist import Specialist, save_specialist
@@ -170,6 +172,38 @@ def test_a_network_that_answers_otherwise_is_an_error(make_specialist):
 def test_a_folder_that_is_missing_is_named_before_any_work(make_rolling, tmp_path):
     with pytest.raises(StorageError, match="create the folder first"):
         export.export_policy(make_rolling(), tmp_path / "nowhere" / "policy.onnx")
+
+
+@pytest.mark.parametrize("name", ["policy.json", "policy", "policy.onnx.json", ".onnx"])
+def test_a_path_that_the_description_would_overwrite_is_refused(make_rolling, tmp_path, name):
+    with pytest.raises(ConfigError, match=r"ends in \.onnx, got"):
+        export.export_policy(make_rolling(), tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_description_that_cannot_be_written_is_named_before_any_work(make_rolling, tmp_path):
+    (tmp_path / "policy.json").mkdir()
+    with pytest.raises(StorageError, match=r"policy\.json"):
+        export.export_policy(make_rolling(), tmp_path / "policy.onnx")
+    assert [path.name for path in tmp_path.iterdir()] == ["policy.json"]
+
+
+class Reading(MLPModel):
+    """A policy that does what no graph can hold: it looks at its own answer."""
+
+    def as_onnx(self, verbose):
+        class Graph(torch.nn.Module):
+            def forward(self, x):
+                return x * len(open("/proc/self/status").read()) if x.sum().item() > 0 else x
+
+        return Graph()
+
+
+def test_a_network_that_onnx_cannot_express_is_named():
+    groups = TensorDict({"policy": torch.zeros(1, 6)}, batch_size=[1])
+    policy = Reading(groups, {"actor": ["policy"]}, "actor", 3, [8])
+    with pytest.raises(ExportError, match="a Reading cannot be written as ONNX"):
+        export.to_onnx(policy)
 
 
 @pytest.mark.slow

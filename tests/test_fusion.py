@@ -34,6 +34,12 @@ def test_the_answer_is_of_the_kind_of_the_question():
     assert isinstance(fused, np.ndarray) and policy_map.dtype == np.int64
 
 
+def test_tensors_on_their_way_through_a_training_are_fused_as_numbers():
+    tensor = torch.full((2, 3, 8), 0.5, requires_grad=True)
+    fused, policy_map = fuse([tensor, 2 * tensor])
+    assert not fused.requires_grad and (fused == 1).all() and (policy_map == 1).all()
+
+
 @pytest.mark.parametrize(
     ("tensors", "message"),
     [
@@ -41,6 +47,14 @@ def test_the_answer_is_of_the_kind_of_the_question():
         ([constant(0.1), constant(0.1)[:1]], "tensor 1 has shape"),
         ([constant(0.1), constant(np.nan)], "tensor 1 holds NaN"),
         ([constant(np.inf)], "tensor 0 holds NaN or infinity"),
+        ([constant(0.5), constant(1.5)], "tensor 1 holds 1.5 to 1.5"),
+        ([constant(-0.1)], "tensor 0 holds -0.1 to -0.1"),
+        ([constant(0.5)[..., :7]], r"tensor 0 has shape \(2, 3, 7\), expected \(nx, ny, 8\)"),
+        ([np.zeros((2, 8))], "tensor 0 has shape"),
+        ([np.zeros((0, 3, 8))], "tensor 0 has shape"),
+        ([np.float64(0.5)], "tensor 0 has shape"),
+        ([constant(0.5).astype(complex)], "tensor 0 holds complex128"),
+        ([constant(0.5).astype(str)], "tensor 0 holds <U"),
     ],
 )
 def test_errors_name_the_tensor(tensors, message):

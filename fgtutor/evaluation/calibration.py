@@ -101,7 +101,7 @@ def evaluate(config: CalibrationConfig, *, progress: bool = False) -> dict[str, 
     if not zoo:
         raise ConfigError("there is no specialist to check: the zoo is empty")
     drives = {
-        name: drive(specialist, specialist.provenance["terrain"], config)
+        name: drive(specialist, specialist.provenance.get("terrain", name), config)
         for name, specialist in tqdm(zoo.items(), disable=not progress, unit="specialist")
     }
     return {name: _check(name, zoo, drives, config) for name in zoo}

@@ -68,7 +68,8 @@ def estimate(
         assess_all(sample.elevation, zoo)
         assessed = time.perf_counter()
         free = np.ones((*sample.elevation.shape, 8))
-        route = plan(free, 0 * free, grid=sample.elevation, start=sample.start, goal=sample.goal)
+        start, goal = sample.start, sample.goal
+        route = plan(free, 0 * free, grid=sample.elevation, start=start, goal=goal, names=[name])
         execute_batch(
             [route] * at_once,
             [sample] * at_once,

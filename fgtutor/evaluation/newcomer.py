@@ -6,7 +6,6 @@ On every ground the tensors of the others are compared, bit for bit.
 Source: paper, Sec. III-C: F_max is a maximum over specialists, so one more only adds to it.
 """
 
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -99,9 +98,9 @@ def zoos(config: NewcomerConfig) -> Iterator[dict[str, Specialist]]:
         folder = Path(name)
         for path in config.folders:
             if path != config.folder:
-                shutil.copytree(path, folder / path.name)
+                (folder / path.name).symlink_to(path.resolve())
         yield load_zoo(config.robot, folder)
-        shutil.copytree(config.folder, folder / config.name)
+        (folder / config.name).symlink_to(config.folder.resolve())
         yield load_zoo(config.robot, folder)
 
 
