@@ -16,6 +16,9 @@ from typing import Any
 
 from fgtutor.errors import StorageError
 
+LOCK = ".lock"
+"""The file in a folder that a process works in; one that was killed leaves it behind, unlocked."""
+
 _ADVICE = {
     errno.ENOSPC: "free some disk space and save again",
     errno.EDQUOT: "your disk quota is used up: free some space and save again",
@@ -67,6 +70,8 @@ def check_writable(path: str | Path) -> None:
     path = Path(path)
     probe = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.probe")
     try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         probe.touch()
         probe.unlink()
     except OSError as error:
@@ -85,13 +90,15 @@ def make_folder(path: str | Path) -> None:
 def locked_folder(path: str | Path) -> Iterator[None]:
     """Make a folder if there is none, and keep other processes out of it for a block.
 
-    The system takes the lock back when the process ends, however it ends. The file `.lock` stays.
+    The system takes the lock back when the process ends, however it ends. A file system without
+    locks keeps nobody out.
 
     Raises:
         StorageError: Another process works in the folder, or the system refuses to write there.
     """
     make_folder(path)
-    file = Path(path) / ".lock"
+    file = Path(path) / LOCK
+    busy = f"another process works in {path}: wait for it to end, or choose another folder"
     try:
         lock = file.open("ab")
     except OSError as error:
@@ -99,13 +106,19 @@ def locked_folder(path: str | Path) -> Iterator[None]:
     with lock:
         try:
             _lock(lock.fileno())
+            # Whoever had it before may have removed it meanwhile, and a third one made a new one.
+            if not os.path.samestat(os.fstat(lock.fileno()), file.stat()):
+                raise StorageError(busy)
         except OSError as error:
-            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES, errno.EAGAIN):
+            if error.errno in (errno.EWOULDBLOCK, errno.EACCES, errno.EAGAIN, errno.ENOENT):
+                raise StorageError(busy) from error
+            if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
                 raise storage_error(file, error) from error
-            raise StorageError(
-                f"another process works in {path}: wait for it to end, or choose another folder"
-            ) from error
-        yield
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                file.unlink()
 
 
 def _lock(file: int) -> None:
