@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from fgtutor import storage
 from fgtutor.errors import StorageError
-from fgtutor.storage import atomic_write
+from fgtutor.storage import LOCK, atomic_write, locked_folder
 
 
 def test_new_file_appears_complete(tmp_path: Path) -> None:
@@ -134,3 +135,43 @@ def test_killed_while_saving_keeps_the_old_file(tmp_path: Path) -> None:
     target.write_text("old")
     subprocess.run([sys.executable, "-c", _KILLED, str(target)], check=False)
     assert target.read_text() == "old"
+
+
+_HOLDING = """
+import sys, time
+from fgtutor.storage import locked_folder
+with locked_folder(sys.argv[1]):
+    print("locked", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_folder_is_one_process_s_until_it_ends_however_it_ends(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "folder"
+    with subprocess.Popen(
+        [sys.executable, "-c", _HOLDING, str(folder)], stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout and other.stdout.readline() == "locked\n"
+        with pytest.raises(StorageError, match="another process works in"), locked_folder(folder):
+            pass
+        other.kill()
+    with locked_folder(folder):
+        assert (folder / LOCK).exists()
+        with pytest.raises(StorageError, match="another process"), locked_folder(folder):
+            pass
+    assert not list(folder.iterdir())
+
+
+def test_a_lock_that_was_removed_meanwhile_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = storage._lock
+
+    def removed_meanwhile(file: int) -> None:
+        lock(file)
+        (tmp_path / LOCK).unlink()
+        (tmp_path / LOCK).touch()
+
+    monkeypatch.setattr(storage, "_lock", removed_meanwhile)
+    with pytest.raises(StorageError, match="another process"), locked_folder(tmp_path):
+        pass

@@ -214,7 +214,7 @@ def test_a_value_that_fits_no_training_is_told_before_any(config):
     config = replace(config, vary=("steps", "8", "1"))
     with pytest.raises(ConfigError, match="rollouts of 1 steps never see half"):
         sweep.run(config)
-    assert not list(config.folder.iterdir())
+    assert not list(config.folder.rglob("*"))
 
 
 def test_a_folder_that_cannot_be_written_is_told_at_once(config, monkeypatch):

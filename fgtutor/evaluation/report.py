@@ -14,7 +14,6 @@ A config that inherits `RunConfig`. And a function that makes `Findings` of the 
 """
 
 import json
-import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -26,7 +25,8 @@ from fgtutor.evaluation.cost import Estimate
 from fgtutor.evaluation.metrics import wilson_interval
 from fgtutor.evaluation.runner import Row, Task
 from fgtutor.evaluation.shards import Run, RunConfig, collect, finished
-from fgtutor.storage import atomic_write, make_folder, write_json
+from fgtutor.machine import usable_cores
+from fgtutor.storage import atomic_write, locked_folder, make_folder, write_json
 
 TABLE, ROWS, RUN, FIGURES = "table.md", "rows.json", "run.json", "figures"
 
@@ -100,22 +100,25 @@ def run_and_report(
     Returns the exit status of its command, 0. Raises what `collect` and `write_report` raise.
     """
     began = time.time()
-    left = len(tasks) - len(finished(tasks, settings, config))
-    if left:
-        # How many cores a cluster will give is not known before it does.
-        cores = 1 if config.ray else config.workers or os.cpu_count() or 1
-        print(f"{left} of {len(tasks)} tasks to do; all of them: {cost().on(cores)}", flush=True)
-    with watched or nullcontext():
-        run = collect(tasks, settings, config, progress=True)
-    if not run.complete:
-        print(f"{run}; give the other parts' folders to --merge for the table")
+    with locked_folder(config.out) if config.out else nullcontext():
+        left = len(tasks) - len(finished(tasks, settings, config))
+        if left:
+            # How many cores a cluster will give is not known before it does.
+            cores = 1 if config.ray else config.workers or usable_cores()
+            print(
+                f"{left} of {len(tasks)} tasks to do; all of them: {cost().on(cores)}", flush=True
+            )
+        with watched or nullcontext():
+            run = collect(tasks, settings, config, progress=True)
+        if not run.complete:
+            print(f"{run}; give the other parts' folders to --merge for the table")
+            return 0
+        found = find(run.rows)
+        print(f"{found.table}\n\n{found.caption}")
+        if config.out:
+            write_report(config.out, run, found, title=title, settings=settings, began=began)
+            print(f"report -> {config.out}")
         return 0
-    found = find(run.rows)
-    print(f"{found.table}\n\n{found.caption}")
-    if config.out:
-        write_report(config.out, run, found, title=title, settings=settings, began=began)
-        print(f"report -> {config.out}")
-    return 0
 
 
 def write_report(

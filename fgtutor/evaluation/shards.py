@@ -22,7 +22,7 @@ from tqdm import tqdm
 from fgtutor import __version__
 from fgtutor.errors import ConfigError, ReportError
 from fgtutor.evaluation.runner import Result, Row, Task, run_tasks
-from fgtutor.storage import make_folder, write_json
+from fgtutor.storage import LOCK, make_folder, write_json
 from fgtutor.validation import Count, CountOrZero, NonNegative, check_fields, read_record
 
 T = TypeVar("T")
@@ -189,7 +189,7 @@ def _open(folder: Path, settings: dict[str, Any]) -> None:
 
 def _check(folder: Path, settings: dict[str, Any], *, new: bool) -> None:
     """Raise `ReportError` unless the folder is this run's, or empty where a `new` one may begin."""
-    if new and folder.is_dir() and not any(folder.iterdir()):
+    if new and folder.is_dir() and all(path.name == LOCK for path in folder.iterdir()):
         return
     try:
         theirs = read_record(dict[str, Any], folder / SETTINGS, ReportError)
