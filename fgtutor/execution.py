@@ -27,6 +27,8 @@ from fgtutor.specialist import Specialist
 from fgtutor.terrain import Terrain, World
 from fgtutor.validation import Count, Unbounded, check_fields
 
+LONGEST = 100_000.0
+"""The longest route that is driven, m."""
 Magnitude = Annotated[float, Interval(ge=0, le=1000)]
 """A length, m, an angle, rad, or the error of one."""
 Factor = Annotated[float, Interval(ge=0, le=1e6)]
@@ -317,6 +319,8 @@ class _Track:
         xy = np.asarray(route.xy, dtype=np.float64)
         at = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))))
         self.length = float(at[-1])
+        if self.length > LONGEST:
+            raise ConfigError(f"a route of {self.length:g} m is too long, at most {LONGEST:g} m")
         distance = np.append(np.arange(0.0, self.length, self.SPACING), self.length)
         edge = np.clip(np.searchsorted(at, distance, "right") - 1, 0, max(len(at) - 2, 0))
         self.points = np.stack([np.interp(distance, at, xy[:, axis]) for axis in (0, 1)], axis=-1)

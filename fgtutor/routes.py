@@ -18,6 +18,9 @@ from fgtutor import directions
 from fgtutor.errors import PlanningError
 from fgtutor.validation import parse_record
 
+LARGEST = 1e12
+"""The largest number in a route; sums of larger ones lose their metres, or overflow."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Route:
@@ -63,14 +66,14 @@ class Route:
                 raise PlanningError(f"{name} should be an array {shape}, is {got}")
             if array.dtype.kind not in ("iu" if kind is int else "iuf"):
                 raise PlanningError(f"{name} should hold {kind.__name__}, holds {array.dtype}")
-            if not np.isfinite(array).all():
-                raise PlanningError(f"{name} should hold finite numbers")
+            if not (np.abs(array) <= LARGEST).all():
+                raise PlanningError(f"{name} should hold finite numbers up to {LARGEST:g}")
         for what, count in (("headings", headings), ("policies", len(names))):
             if not all(0 <= index < count for index in getattr(self, what).tolist()):
                 raise PlanningError(f"{what} should be numbers from 0 to {count - 1}")
         if (np.diff(self.cells.astype(int), axis=0) != directions.STEPS[self.headings]).any():
             raise PlanningError("each cell should be the last one's neighbour along the heading")
-        if not (0 <= self.length < np.inf and (self.costs >= 0).all()):
+        if not (0 <= self.length <= LARGEST and (self.costs >= 0).all()):
             raise PlanningError("length and costs should be numbers from 0")
 
     @property

@@ -273,3 +273,11 @@ def test_a_negative_seed_is_refused(make_rolling):
     route, terrain = task((1.0, 2.0), (4.0, 2.0))
     with pytest.raises(ConfigError, match="seeds are numbers from 0, got -1"):
         execute(route, terrain, {"roll": make_rolling()}, seed=-1)
+
+
+def test_a_route_that_leaps_to_the_moon_is_refused(make_rolling):
+    route, terrain = task((1.0, 2.0), (4.0, 2.0))
+    xy = route.xy.copy()
+    xy[-1] = 3.8e8
+    with pytest.raises(ConfigError, match="too long"):
+        execute(replace(route, xy=xy), terrain, {"roll": make_rolling()})

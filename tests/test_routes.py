@@ -99,6 +99,8 @@ def test_a_key_of_another_kind_is_refused_or_means_the_same(route, key):
         (("xy", 0, 0), float("nan"), "finite"),
         (("feasibility", 0), float("inf"), "finite"),
         (("costs", 0), -1.0, "costs"),
+        (("costs", 0), 1e308, "costs should hold finite numbers"),
+        (("xy", 0, 0), -1e308, "xy should hold finite numbers"),
         (("costs", 0), "2", "costs"),
         (("names", 0), 3, "names"),
         (("names", 0), "gaps", "name of its own"),
