@@ -234,6 +234,17 @@ def test_no_thief_scores_or_reports_what_he_took(tmp_path):
     assert not any("hunter2" in text or "test_sandbox" in text for text in texts)
 
 
+def test_without_landlock_the_hook_stands_and_the_grader_says_so(tmp_path, monkeypatch, capsys):
+    older = "import fgtutor.teach.confinement as c; c.landlock_version = lambda: 0; main()"
+    monkeypatch.setattr(sandbox, "START", sandbox.START.replace("main()", older))
+    cell = f"def path_length(xy): return open({str(CLONE / 'solutions/src/ex10.py')!r}).read()"
+    path = submit(tmp_path, "ada", HONEST[0], cell, *HONEST[3:])
+    assert grading.run(GradeConfig(paths=(path,), **QUICK)) == 0
+    printed = capsys.readouterr().out
+    assert "lacks: other files unread;" in printed and "4 of 6" in printed
+    assert "does not allow opening" in printed
+
+
 def test_the_code_of_the_current_folder_does_not_run(tmp_path, monkeypatch):
     for name in ("numpy", "json", "random", "IPython", "fgtutor", "sitecustomize"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('ran the wrong file')")
