@@ -103,7 +103,7 @@ def build_networks(
             return config.build(), FeasibilityNet(**vars(numbers))
     except Exception as error:  # the class of a policy may be anybody's
         raise SpecialistError(
-            f"{where}: no policy can be built of this description ({error}): {CURE}"
+            f"{where}: no policy can be built of this description ({str(error)!r:.300}): {CURE}"
         ) from error
 
 
@@ -170,7 +170,9 @@ def read_tensors(path: Path, told: Description, twin: nn.Module) -> dict[str, Te
     try:
         tensors = safetensors.torch.load(payload)
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise SpecialistError(f"{path} is not a safetensors file ({error}): {CURE}") from error
+        raise SpecialistError(
+            f"{path} is not a safetensors file ({str(error)!r:.300}): {CURE}"
+        ) from error
     compare(twin, tensors, str(path))
     return tensors
 

@@ -132,6 +132,8 @@ GOOD = {"settings": {}, "rows": [{"x": 1}], "seconds": 1.0, "machine": {}}
         *(json.dumps(GOOD | {"seconds": v}).encode() for v in (-1, 10**400, None, True, [])),
         *(json.dumps(GOOD | {"rows": v}).encode() for v in ({}, [[]], [1], None)),
         json.dumps(GOOD | {"seconds": float("nan")}).encode(),
+        json.dumps(GOOD | {"rows": [{"x": float("nan")}]}).encode(),
+        json.dumps(GOOD | {"machine": {"cores": [float("inf")]}}).encode(),
     ],
 )
 def test_a_shard_that_cannot_be_read_is_done_again(tmp_path, diary, content):

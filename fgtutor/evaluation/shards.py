@@ -62,6 +62,9 @@ class _Shard:
     seconds: NonNegative
     machine: dict[str, Any]
 
+    def __post_init__(self) -> None:
+        json.dumps([self.rows, self.machine], allow_nan=False)  # ValueError for no number
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Run:
