@@ -34,7 +34,7 @@ Q1, Q3 = "ex10.q1", "ex10.q3"
         {"changed": 0, "answers": None, "points": 100},
         {"answers": None, "detail": None},
         {"answers": [float("nan")]},
-        {"answers": [[]] * 10**6},
+        {"answers": [[]] * 10**5},
         {"answers": [{"list": [{"list": []}] * 10**5}]},
         {"answers": [{"array": ["float64", [0, 10**18], ""]}]},
         {"answers": [{"array": ["float64", "1", "AAAAAAAA8D8="]}]},

@@ -174,18 +174,19 @@ class _Worker:
         }
         self.confined: list[str] = []
         self.buffer = b""
-        # LD_LIBRARY_PATH is no secret, and some Pythons do not start without it. matplotlib wants a
-        # home and a folder that could be written to.
+        # LD_LIBRARY_PATH is no secret, and some Pythons do not start without it. Packages may be
+        # installed at home. matplotlib wants a folder that looks as if it could be written to.
         kept = {name: os.environ[name] for name in ("LD_LIBRARY_PATH",) if name in os.environ}
         one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
-        plots = {"MPLBACKEND": "Agg", "MPLCONFIGDIR": tempfile.gettempdir(), "HOME": "/"}
+        plots = {"MPLBACKEND": "Agg", "MPLCONFIGDIR": tempfile.gettempdir()}
+        home = {"HOME": os.path.expanduser("~"), "LANG": "C.UTF-8"}
         self.process = subprocess.Popen(
             [sys.executable, "-P", "-B", "-c", START, ROOT],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             cwd="/",  # nothing can be written, so no folder is needed that would have to be removed
-            env=kept | one_thread | plots | {"LANG": "C.UTF-8"},
+            env=kept | one_thread | plots | home,
             start_new_session=True,
         )
         assert self.process.stdin and self.process.stdout
