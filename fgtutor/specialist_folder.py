@@ -97,7 +97,7 @@ def build_networks(
     config: PolicyConfig, sizes: Mapping[str, Any], device: str, where: str
 ) -> tuple[MLPModel, FeasibilityNet]:
     """Build both networks; torch's random state stays, so that a save changes no training."""
-    numbers = parse_record(arguments(FeasibilityNet), sizes, SpecialistError, f"{where}: sizes")
+    numbers = parse_record(arguments(FeasibilityNet), sizes, SpecialistError, f"{where}: feasibility")
     try:
         with torch.random.fork_rng(devices=[]), torch.device(device):
             return config.build(), FeasibilityNet(**vars(numbers))
@@ -159,8 +159,8 @@ def read_tensors(path: Path, told: Description, twin: nn.Module) -> dict[str, Te
     most = sum(tensor.nbytes for tensor in state) + MOST_HEADER
     if weights > MOST_WEIGHTS or expected.bytes > most:
         raise SpecialistError(
-            f"{path}: a network of {weights} weights cannot have {expected.bytes} bytes, and may "
-            f"have {MOST_WEIGHTS} weights: {CURE}"
+            f"{path}: the description asks for {weights} weights (at most {MOST_WEIGHTS} are "
+            f"read) in {expected.bytes} bytes (here at most {most}): {CURE}"
         )
     payload = _read(path, expected.bytes)
     if len(payload) != expected.bytes:
