@@ -97,7 +97,9 @@ def build_networks(
     config: PolicyConfig, sizes: Mapping[str, Any], device: str, where: str
 ) -> tuple[MLPModel, FeasibilityNet]:
     """Build both networks; torch's random state stays, so that a save changes no training."""
-    numbers = parse_record(arguments(FeasibilityNet), sizes, SpecialistError, f"{where}: feasibility")
+    numbers = parse_record(
+        arguments(FeasibilityNet), sizes, SpecialistError, f"{where}: feasibility"
+    )
     try:
         with torch.random.fork_rng(devices=[]), torch.device(device):
             return config.build(), FeasibilityNet(**vars(numbers))
