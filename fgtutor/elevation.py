@@ -16,9 +16,7 @@ from scipy import ndimage
 
 from fgtutor import mapfiles
 from fgtutor.errors import MapError, OffMapError
-
-_EDGE = 1e-9
-"""Slack in cells, so that 0.3 / 0.1 = 2.9999999999999996 still counts as the border of cell 3."""
+from fgtutor.grid import cells_of, coordinate_text, point_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +104,13 @@ class ElevationMap:
             OffMapError: The point lies outside the map.
         """
         if not self.contains(x, y):
-            x0, y0, x1, y1 = self.extent
+            x0, y0, x1, y1 = (coordinate_text(value, self.resolution) for value in self.extent)
             raise OffMapError(
-                f"({x:g}, {y:g}) m is off the map, which covers x from {x0:g} to {x1:g} m and "
-                f"y from {y0:g} to {y1:g} m: choose a point inside"
+                f"{point_text((x, y), self.resolution)} m is off the map, which covers x from {x0} "
+                f"to {x1} m and y from {y0} to {y1} m: choose a point inside"
             )
-        u = (x - self.origin[0]) / self.resolution + _EDGE
-        v = (y - self.origin[1]) / self.resolution + _EDGE
-        return min(max(int(u), 0), self.shape[0] - 1), min(max(int(v), 0), self.shape[1] - 1)
+        ix, iy = cells_of((x, y), self.origin, self.resolution).tolist()
+        return min(ix, self.shape[0] - 1), min(iy, self.shape[1] - 1)
 
     def centre_of(self, ix: int, iy: int) -> tuple[float, float]:
         """Return the centre (x, y) of a cell, m; the cell need not be on the map."""
@@ -124,9 +121,12 @@ class ElevationMap:
 
     def contains(self, x: float, y: float) -> bool:
         """Return whether a point lies on the map, its border included."""
-        x0, y0, x1, y1 = self.extent
-        slack = _EDGE * self.resolution
-        return x0 - slack <= x <= x1 + slack and y0 - slack <= y <= y1 + slack
+        if math.isnan(x) or math.isnan(y):
+            return False
+        # Turned over, a border belongs to the lower cell: so the far one is on the map.
+        low = cells_of((x, y), self.origin, self.resolution)
+        high = cells_of((-x, -y), [-corner for corner in self.extent[2:]], self.resolution)
+        return bool((low >= 0).all() and (high >= 0).all())
 
     def height_at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Interpolate heights bilinearly between cell centres; beyond them the edge cell continues.
@@ -214,8 +214,9 @@ class ElevationMap:
         iy = np.flatnonzero((y >= y0) & (y <= y1))
         if len(ix) < 2 or len(iy) < 2:
             raise MapError(
-                f"crop to ({x0:g}, {y0:g})..({x1:g}, {y1:g}) m leaves {len(ix)} x {len(iy)} cells "
-                f"of the map over {self.extent}; at least 2 x 2 are needed"
+                f"crop to {point_text((x0, y0, x1, y1), self.resolution)} m leaves {len(ix)} x "
+                f"{len(iy)} cells of the map over {point_text(self.extent, self.resolution)} m; at "
+                "least 2 x 2 are needed"
             )
         window = slice(ix[0], ix[-1] + 1), slice(iy[0], iy[-1] + 1)
         corner_x, corner_y = self.centre_of(int(ix[0]), int(iy[0]))
@@ -239,7 +240,7 @@ class ElevationMap:
             for length in self.size
         ]
         ix, iy = (
-            np.minimum((step / self.resolution + _EDGE).astype(int), n - 1)
+            np.minimum(cells_of(step, 0.0, self.resolution), n - 1)
             for step, n in zip(steps, self.shape, strict=True)
         )
         known = self.known[np.ix_(ix, iy)]

@@ -107,7 +107,7 @@ def test_cell_of(point: tuple[float, float], cell: tuple[int, int]) -> None:
 def test_points_off_the_map(point: tuple[float, float]) -> None:
     elevation = ElevationMap(np.zeros((10, 4)))
     assert not elevation.contains(*point)
-    with pytest.raises(OffMapError, match=r"x from 0 to 1 m and y from 0 to 0\.4 m"):
+    with pytest.raises(OffMapError, match=r"x from 0\.00 to 1\.00 m and y from 0\.00 to 0\.40 m"):
         elevation.cell_of(*point)
 
 
