@@ -9,6 +9,7 @@ Source: paper, Sec. III-A and Fig. 2.
 import contextlib
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -116,6 +117,7 @@ def _iterate(
             disable=not (attended and leads()),
         ) as bar,
         stop_on_interrupt() if attended else contextlib.nullcontext(lambda: False) as stopped,
+        _quiet_threads(),
     ):
         bar.set_description(f"{config.robot} {config.terrain}")
         while trainer.iteration < config.iterations:
@@ -138,6 +140,19 @@ def _iterate(
         if trainer.iteration != trainer.saved:
             trainer.save()
         return stopped() and trainer.iteration < config.iterations
+
+
+@contextlib.contextmanager
+def _quiet_threads() -> Iterator[None]:
+    """Let threads not print an OSError: the curves' own says what the run's error then says too."""
+    before = threading.excepthook
+    threading.excepthook = lambda what: (
+        None if isinstance(what.exc_value, OSError) else before(what)
+    )
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 @contextlib.contextmanager
