@@ -7,8 +7,11 @@ Reads nothing; gives a temporary path in the target's own folder and moves it in
 import errno
 import json
 import os
+import platform
 import secrets
+import shutil
 import sys
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -29,6 +32,8 @@ _ADVICE = {
     errno.ENOENT: "create the folder first",
     errno.ENOTDIR: "a part of the path is a file, not a folder: choose another path",
     errno.EISDIR: "the path is a folder: give the name of a file in it",
+    errno.EINVAL: "give the name of a file",
+    errno.ENAMETOOLONG: "choose a shorter name",
 }
 
 
@@ -37,26 +42,101 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; move it to `path` once the block has succeeded.
 
     The block creates and writes the temporary file (it keeps the suffix, for writers that look at
-    it). If the block or the move fails, the temporary file is removed and `path` is as it was.
+    it). If the block or the move fails, the temporary file is removed and `path` is as it was. If
+    `path` is a link, the file that it shows to is written. What a killed process left is removed.
 
     Raises:
-        StorageError: The system refused to write (full disk, read-only or missing folder).
+        StorageError: The system refused to write (full disk, read-only or missing folder), or the
+            path is a folder, a device or a pipe.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    with atomic_write_all(path) as (temporary,):
+        yield temporary
+
+
+@contextmanager
+def atomic_write_all(*paths: str | Path) -> Iterator[list[Path]]:
+    """Do as `atomic_write` with files that belong together; if one move fails, none is made.
+
+    Only a process that is killed between two moves leaves some new and some old; a reader has to
+    see from their contents that these do not belong together.
+    """
+    temporaries: list[Path] = []
+    earlier: dict[Path, Path | None] = {}
     try:
         try:
-            yield temporary
-            # Data must reach the disk before the name does, or a power cut leaves an empty file.
-            with temporary.open("r+b") as file:
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
+            targets = [_target(Path(path)) for path in paths]
+            temporaries = [_beside(target, target.suffix) for target in targets]
+            yield temporaries
+            for temporary in temporaries:
+                # Data must reach the disk before the name, or a power cut leaves an empty file.
+                with temporary.open("r+b") as file:
+                    os.fsync(file.fileno())
+            for target in targets[:-1]:
+                earlier[target] = _copy(target)
+            for temporary, target in zip(temporaries, targets, strict=True):
+                os.replace(temporary, target)
         except BaseException:
-            with suppress(OSError):
-                temporary.unlink()
+            for target, copy in earlier.items():
+                with suppress(OSError):
+                    os.replace(copy, target) if copy else target.unlink(missing_ok=True)
             raise
+        finally:
+            for path in (*temporaries, *filter(None, earlier.values())):
+                with suppress(OSError):
+                    path.unlink(missing_ok=True)
     except OSError as error:
-        raise storage_error(path, error) from error
+        raise storage_error(paths[0], error) from error
+
+
+def _target(path: Path) -> Path:
+    """Return the file that is to be written, links followed, beside which nothing old is left."""
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    if target.is_dir():
+        raise storage_error(path, OSError(errno.EISDIR, os.strerror(errno.EISDIR)))
+    if target.exists() and not target.is_file():
+        raise storage_error(path, OSError(errno.EINVAL, "it is a device or a pipe"))
+    start = f".fgtutor-{_key(target)}-"
+    for file in target.parent.glob(f"{start}*"):
+        writer = file.name.removeprefix(start).split("-")[0]
+        if writer.isdecimal() and not _is_running(int(writer)):
+            with suppress(OSError):
+                file.unlink()
+    return target
+
+
+def _beside(path: Path, suffix: str = "") -> Path:
+    """Return a hidden, short name in the path's folder, which tells who writes which file."""
+    suffix = suffix if len(os.fsencode(suffix)) <= 20 else ""
+    return path.with_name(f".fgtutor-{_key(path)}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
+
+
+def _key(path: Path) -> str:
+    """Return eight digits for the file's name on this computer, whose processes we can ask for."""
+    return f"{zlib.crc32(os.fsencode(f'{platform.node()}/{path.name}')):08x}"
+
+
+def _is_running(process: int) -> bool:
+    if sys.platform == "win32":
+        return True  # there, asking ends it
+    try:
+        os.kill(process, 0)
+    except PermissionError:
+        return True
+    except (ProcessLookupError, OverflowError):
+        return False
+    return True
+
+
+def _copy(path: Path) -> Path | None:
+    """Return a second name for a file, or a copy where the file system gives it none."""
+    if not path.exists():
+        return None
+    copy = _beside(path)
+    try:
+        os.link(path, copy)
+    except OSError:
+        shutil.copyfile(path, copy)
+    return copy
 
 
 def write_json(path: str | Path, data: Any) -> None:
@@ -67,11 +147,8 @@ def write_json(path: str | Path, data: Any) -> None:
 
 def check_writable(path: str | Path) -> None:
     """Raise `StorageError` now if `path` could not be written later, when the work is done."""
-    path = Path(path)
-    probe = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.probe")
     try:
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        probe = _beside(_target(Path(path)))
         probe.touch()
         probe.unlink()
     except OSError as error:
@@ -98,9 +175,8 @@ def locked_folder(path: str | Path) -> Iterator[None]:
     """
     make_folder(path)
     file = Path(path) / LOCK
-    busy = f"another process works in {path}: wait for it to end, or choose another folder"
     try:
-        lock = file.open("ab")
+        lock = file.open("a+b")
     except OSError as error:
         raise storage_error(file, error) from error
     with lock:
@@ -108,10 +184,16 @@ def locked_folder(path: str | Path) -> Iterator[None]:
             _lock(lock.fileno())
             # Whoever had it before may have removed it meanwhile, and a third one made a new one.
             if not os.path.samestat(os.fstat(lock.fileno()), file.stat()):
-                raise StorageError(busy)
+                raise BlockingIOError(errno.EAGAIN, "")
+            lock.truncate(0)
+            lock.write(b"%d" % os.getpid())
+            lock.flush()
         except OSError as error:
             if error.errno in (errno.EWOULDBLOCK, errno.EACCES, errno.EAGAIN, errno.ENOENT):
-                raise StorageError(busy) from error
+                raise StorageError(
+                    f"another process{_holder(file)} works in {path}: wait for it to end, or "
+                    "choose another folder"
+                ) from error
             if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
                 raise storage_error(file, error) from error
         try:
@@ -119,6 +201,13 @@ def locked_folder(path: str | Path) -> Iterator[None]:
         finally:
             with suppress(OSError):
                 file.unlink()
+
+
+def _holder(lock: Path) -> str:
+    """Return who holds a lock, if the file tells."""
+    with suppress(OSError, ValueError):
+        return f" ({int(lock.read_text())})"
+    return ""
 
 
 def _lock(file: int) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from fgtutor import storage
 from fgtutor.errors import StorageError
-from fgtutor.storage import LOCK, atomic_write, locked_folder
+from fgtutor.storage import LOCK, atomic_write, atomic_write_all, check_writable, locked_folder
 
 
 def test_new_file_appears_complete(tmp_path: Path) -> None:
@@ -135,6 +135,103 @@ def test_killed_while_saving_keeps_the_old_file(tmp_path: Path) -> None:
     target.write_text("old")
     subprocess.run([sys.executable, "-c", _KILLED, str(target)], check=False)
     assert target.read_text() == "old"
+    assert len(list(tmp_path.iterdir())) == 2
+    with atomic_write(tmp_path / "another") as other, atomic_write(target) as temporary:
+        other.write_text("x")
+        temporary.write_text("new")
+    assert {file.name for file in tmp_path.iterdir()} == {"state", "another"}
+
+
+def test_what_a_running_process_writes_is_left_alone(tmp_path: Path) -> None:
+    with atomic_write(tmp_path / "state") as first:
+        first.write_text("first")
+        with atomic_write(tmp_path / "state") as second:
+            second.write_text("second")
+    assert (tmp_path / "state").read_text() == "first"
+
+
+def test_a_link_goes_on_showing_where_it_did(tmp_path: Path) -> None:
+    (tmp_path / "far").mkdir()
+    link, target = tmp_path / "link.json", tmp_path / "far" / "real.json"
+    link.symlink_to(target)
+    for text in ("new", "again"):  # at first nothing is there
+        with atomic_write(link) as temporary:
+            assert temporary.parent == target.parent
+            temporary.write_text(text)
+        assert link.is_symlink() and target.read_text() == text
+    assert [file.name for file in tmp_path.iterdir() if file != link] == ["far"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [b"x" * 255, b"x" * 251 + b".npz", b"a." + b"y" * 250, "ü".encode() * 125, b"M\xfcller.npz"],
+)
+def test_any_name_that_the_system_takes(tmp_path: Path, name: bytes) -> None:
+    target = tmp_path / os.fsdecode(name)
+    check_writable(target)
+    with atomic_write(target) as temporary:
+        temporary.write_text("x")
+    assert os.listdir(os.fsencode(tmp_path)) == [name]
+
+
+def test_a_name_that_is_too_long(tmp_path: Path) -> None:
+    with (
+        pytest.raises(StorageError, match="choose a shorter name"),
+        atomic_write(tmp_path / ("x" * 300)) as temporary,
+    ):
+        temporary.write_text("x")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe", "link to a folder"])
+def test_what_is_no_file_is_not_replaced(tmp_path: Path, kind: str) -> None:
+    target = tmp_path / "target"
+    if kind == "folder":
+        target.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(target)
+    else:
+        target.symlink_to(tmp_path)
+    mode = target.lstat().st_mode
+    with pytest.raises(StorageError, match="name of a file"):
+        check_writable(target)
+    with pytest.raises(StorageError, match="name of a file"), atomic_write(target):
+        raise AssertionError("nothing was to be written")
+    assert target.lstat().st_mode == mode and list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("old", [True, False])
+@pytest.mark.parametrize("linking", [True, False])
+def test_files_that_belong_together_change_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: bool, linking: bool
+) -> None:
+    paths = [tmp_path / name for name in "abc"]
+    for path in paths if old else ():
+        path.write_text("old")
+    move, moved = os.replace, []
+
+    def refuse_the_third(source: Path, target: Path) -> None:
+        moved.append(target)
+        if len(moved) == 3:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", refuse_the_third)
+    if not linking:
+        monkeypatch.setattr(os, "link", lambda *_: os.listdir(tmp_path / "none"))  # an OSError
+    with pytest.raises(StorageError, match="check the path"), atomic_write_all(*paths) as parts:
+        for part in parts:
+            part.write_text("new")
+    assert moved[:3] == paths
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == (
+        dict.fromkeys("abc", "old") if old else {}
+    )
+    with atomic_write_all(*paths) as parts:
+        for part in parts:
+            part.write_text("newer")
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == dict.fromkeys(
+        "abc", "newer"
+    )
 
 
 _HOLDING = """
@@ -152,7 +249,8 @@ def test_a_folder_is_one_process_s_until_it_ends_however_it_ends(tmp_path: Path)
         [sys.executable, "-c", _HOLDING, str(folder)], stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout and other.stdout.readline() == "locked\n"
-        with pytest.raises(StorageError, match="another process works in"), locked_folder(folder):
+        busy = rf"another process \({other.pid}\) works in"
+        with pytest.raises(StorageError, match=busy), locked_folder(folder):
             pass
         other.kill()
     with locked_folder(folder):
