@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -127,3 +129,73 @@ def test_the_module_runs_as_a_program():
         check=False,
     )
     assert done.returncode == cli.USAGE and "nonsense" in done.stderr and not done.stdout
+
+
+NAMESAKES = (
+    *("random", "socket", "pickle", "tempfile", "json", "logging", "subprocess", "signal"),
+    *("numpy", "torch", "mujoco", "scipy", "laspy", "fgtutor", "sitecustomize", "site"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="the program lies elsewhere on Windows")
+def test_no_command_runs_code_of_the_current_folder(tmp_path, zoo):
+    for name in NAMESAKES:
+        (tmp_path / f"{name}.py").write_text(
+            f"open({str(tmp_path / 'ran')!r}, 'a').write({name!r} + chr(10))"
+        )
+    (tmp_path / "c.xyz").write_text("0.01 0.01 0\n0.02 0.02 0\n")
+    program = Path(sys.executable).with_name("fgtutor")
+    evaluation = ["--terrains", "flat", "--policies", "steps", "--protocol", "paper", "--trials", 2]
+    for words in (
+        ["doctor", "--zoo", zoo.parent, "--gl-seconds", 30],
+        ["evaluate", "matrix", "--zoo", zoo, *evaluation, "--workers", 2],
+        ["map", "c.xyz", "--out", "m.npz"],
+        ["export", zoo / "steps"],
+    ):
+        done = subprocess.run(
+            [program, *map(str, words)],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert "Traceback" not in done.stderr, done.stderr
+        assert not (tmp_path / "ran").exists(), (words, (tmp_path / "ran").read_text())
+
+
+@pytest.mark.slow
+def test_drawing_runs_no_code_of_the_current_folder(tmp_path, monkeypatch):
+    import mujoco
+
+    from fgtutor.errors import RenderingError
+    from fgtutor.robots.offscreen import Renderer
+
+    (tmp_path / "mujoco.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    monkeypatch.chdir(tmp_path)
+    with suppress(RenderingError), Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8):
+        pass
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_pipe_that_nobody_reads_is_no_error(tmp_path):
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "fgtutor", "doctor", "--no-gl", "--zoo", str(tmp_path)],
+        stdout=write,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    os.close(write)
+    assert done.returncode == cli.UNREAD and not done.stderr
+
+
+def test_a_package_that_is_not_installed_gives_one_line(capsys, monkeypatch):
+    def absent(name):
+        raise ModuleNotFoundError("No module named 'jupytext'", name="jupytext")
+
+    monkeypatch.setattr("importlib.import_module", absent)
+    assert cli.main(["notebooks"]) == cli.USAGE
+    assert "the package jupytext is not installed; " in capsys.readouterr().err
