@@ -282,7 +282,7 @@ calibration_plot(*calibration(exam.predicted, exam.measured))
 # ## What to try
 #
 # - Train in earnest, from a shell: `fgtutor train --robot a1 --terrain gentle`, then
-#   `fgtutor train --robot a1 --terrain steps --from runs/a1-gentle/specialist --hours 1`, and
+#   `fgtutor train --robot a1 --terrain steps --from runs/a1-gentle-seed1/specialist --hours 1`, and
 #   again with `--resume` as often as you have an hour.
 # - `critic_warmup=0`: what happens to $r_v$ in the first iterations, and why?
 # - `rows=1` puts every robot on the hardest ground at once. Compare the curves.

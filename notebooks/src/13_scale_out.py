@@ -97,8 +97,8 @@ print(f"better in {(fused > alone).float().mean():.0%} of all cells and headings
 # it is let in, calibration on its own ground (notebook 09) and distrust on everybody else's
 # (notebook 04). To train a real fifth one, for ramps of 25 degrees, say:
 #
-#     fgtutor train --robot a1 --terrain slopes --from runs/a1-gentle/specialist
-#     cp -r runs/a1-slopes/specialist fgtutor/zoo/a1/slopes
+#     fgtutor train --robot a1 --terrain slopes --from runs/a1-gentle-seed1/specialist
+#     cp -r runs/a1-slopes-seed1/specialist fgtutor/zoo/a1/slopes
 #     fgtutor doctor
 #     fgtutor evaluate calibration --robot a1
 #     fgtutor evaluate newcomer --robot a1 --newcomer slopes
