@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Annotated, Self
 
 import numpy as np
-from annotated_types import Ge, Interval
+from annotated_types import Interval
 from jaxtyping import Float
 
 from fgtutor.boxes import Box, boxes_from_elevation, columns, rasterise
@@ -34,6 +34,8 @@ __all__ = [
 ]
 
 Point = tuple[float, float]
+TerrainSeed = Annotated[int, Interval(ge=0, lt=2**63)]
+"""What a layout is drawn from: odd ones where terrain is evaluated, even ones in training."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +128,7 @@ def make_terrain(
     *,
     robot: str = "toy",
     difficulty: Share = 1.0,
-    seed: Annotated[int, Ge(0)] = 0,
+    seed: TerrainSeed = 0,
     resolution: Resolution | None = None,
     scale: TerrainScale | None = None,
     neighbours: bool = False,
@@ -140,7 +142,7 @@ def make_terrain(
         name: One of `TERRAINS`.
         robot: Whose scale to use, one of `SCALES`.
         difficulty: From 0 (almost flat) to 1 (the full size in the scale).
-        seed: Any integer from 0.
+        seed: Any integer from 0 that has 63 bits.
         resolution: Side of a cell, m; default: the scale's.
         scale: Sizes to use instead of the robot's preset.
         neighbours: Lay other obstacles of the mixed terrain at both ends, a landing away. For

@@ -9,7 +9,17 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import pytest
 
 from fgtutor import __main__ as cli
-from fgtutor.errors import ConfigError
+from fgtutor.baselines import OccupancyConfig, TraversabilityConfig
+from fgtutor.errors import ConfigError, TerrainError
+from fgtutor.execution import FollowConfig
+from fgtutor.obstacles import TerrainScale
+from fgtutor.robots.a1_bodies import A1EnvConfig
+from fgtutor.robots.a1_model import A1Config
+from fgtutor.robots.a1_terms import RewardWeights
+from fgtutor.robots.commands import EnvConfig
+from fgtutor.robots.lidar import LidarConfig
+from fgtutor.robots.toy import ToyModel
+from fgtutor.scanning import ScanConfig
 
 NEEDED: dict[str, Any] = {
     "map": Path("map.npz"),
@@ -24,10 +34,11 @@ NEVER = (math.nan, -math.inf, math.inf, 10**400, "1", True)
 ZERO, BELOW, HUGE = (0,), (-1, -0.5), (10**10, 1e300)
 SENSE = {
     **dict.fromkeys(("start", "goal", "area"), ZERO + BELOW + HUGE),
-    **dict.fromkeys(("hours", "relief", "switch_cost"), ZERO + HUGE),
-    **dict.fromkeys(("clearance", "context_updates", "critic_warmup", "difficulty"), ZERO),
+    **dict.fromkeys(("hours", "outlier_ratio", "relief", "switch_cost"), ZERO + HUGE),
+    "clearance": (*HUGE, math.inf),
+    **dict.fromkeys(("context_updates", "critic_warmup", "difficulty"), ZERO),
     **dict.fromkeys(("easiest", "easiest_at_last", "entropy", "f_min", "gamma", "heights"), ZERO),
-    **dict.fromkeys(("label_seconds", "levels", "neighbours", "outlier_ratio", "seed"), ZERO),
+    **dict.fromkeys(("label_seconds", "levels", "neighbours", "seed"), ZERO),
     **dict.fromkeys(("seeds", "workers"), ZERO),
 }
 """Which unusual values make sense, by the field's name; all others are refused."""
@@ -87,6 +98,30 @@ def build(kind: type, name: str, value: Any) -> Any:
 
 
 FIELDS = numeric()
+
+
+INNER = [
+    (kind, name, hint)
+    for kind in (
+        *(A1Config, A1EnvConfig, EnvConfig, FollowConfig, LidarConfig, OccupancyConfig),
+        *(RewardWeights, ScanConfig, TerrainScale, ToyModel, TraversabilityConfig),
+    )
+    for name, hint in get_type_hints(kind, include_extras=True).items()
+    if with_value(hint, 1) is not None
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "hint"), INNER, ids=[f"{kind.__name__}.{name}" for kind, name, _ in INNER]
+)
+def test_the_numbers_of_robots_terrains_and_planners_are_checked_too(kind, name, hint):
+    for value in (*NEVER, *ZERO, *BELOW, *HUGE):
+        try:
+            build(kind, name, with_value(hint, value))
+        except (ConfigError, TerrainError) as error:
+            assert name in str(error) or value in ZERO + BELOW + HUGE
+        else:
+            assert value in (*ZERO, *BELOW, *HUGE, math.inf), f"{name}={value!r}"
 
 
 def test_all_commands_are_looked_at():

@@ -38,8 +38,8 @@ from fgtutor.planning import plan
 from fgtutor.routes import Route
 from fgtutor.specialist import ZOO, Specialist
 from fgtutor.tensorization import tensorize
-from fgtutor.terrain import Section, Terrain, rasterise
-from fgtutor.validation import Count
+from fgtutor.terrain import Section, Terrain, TerrainSeed, rasterise
+from fgtutor.validation import Count, check_arguments
 from fgtutor.validation import Share as Fraction
 
 COMMAND = "evaluate adaptation"
@@ -61,6 +61,8 @@ RESAMPLES = 2000
 """Resamples of a bootstrap interval."""
 Riser = Annotated[float, Interval(ge=0, le=1.5)]
 """A riser as a share of the robot's highest one."""
+Risers = tuple[Riser, Riser, Riser]
+"""Those of the short, the middle and the long way."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +73,7 @@ class AdaptationConfig(PlannedConfig):
     """Trials per checkpoint."""
     maps: Annotated[int, Interval(ge=1, le=100_000)] = 20
     """Maps that the trials are spread over; their steps differ a little."""
-    heights: tuple[Riser, Riser, Riser] = (0.87, 0.67, 0.2)
+    heights: Risers = (0.87, 0.67, 0.2)
     """Risers of the short, the middle and the long way, as shares of the robot's highest one."""
     f_min: Fraction = 0.45
     """Edges less feasible than this do not exist; a robot that may go around can be choosy."""
@@ -95,13 +97,14 @@ class AdaptationConfig(PlannedConfig):
         return tuple(terrain_seed(self.seed, trial) for trial in trials)
 
 
-def make_map(robot: str, seed: int, heights: Sequence[float] = AdaptationConfig.heights) -> Terrain:
+def make_map(robot: str, seed: TerrainSeed, heights: Risers = AdaptationConfig.heights) -> Terrain:
     """Make a map with a wall between start and goal, and three gates in it, the nearest first.
 
     In each gate lie two steps up and two down. The seed draws their risers (up to a tenth less than
     `heights`, shares of the robot's highest) and their treads; the wall and the gates stay.
     Raises `TerrainError` for an unknown robot.
     """
+    check_arguments(make_map, locals(), TerrainError)
     if robot not in SCALES:
         raise TerrainError(f"unknown robot {robot!r}: choose one of {', '.join(SCALES)}")
     width = BELOW + GATES[-1] + GATE_WIDTH

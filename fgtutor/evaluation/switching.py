@@ -36,8 +36,8 @@ from fgtutor.robots.lidar import scan_terrain, survey
 from fgtutor.routes import Route
 from fgtutor.scanning import ScanConfig, map_points
 from fgtutor.specialist import GENERAL, Specialist
-from fgtutor.terrain import Section, Terrain, rasterise
-from fgtutor.validation import Count, Positive, Unique
+from fgtutor.terrain import Section, Terrain, TerrainSeed, rasterise
+from fgtutor.validation import Count, Positive, Unique, check_arguments
 from fgtutor.validation import Share as Fraction
 
 T = TypeVar("T")
@@ -132,13 +132,14 @@ def _choose(what: str, names: Sequence[str], known: Mapping[str, T]) -> dict[str
 
 
 def lay_course(
-    kinds: Sequence[str], *, robot: str = "toy", difficulty: float = 1.0, seed: int = 0
+    kinds: Sequence[str], *, robot: str = "toy", difficulty: Fraction = 1.0, seed: TerrainSeed = 0
 ) -> Terrain:
     """Lay obstacles in the order given, with flat ground before, between and behind them.
 
     As the mixed terrain of `make_terrain`, but all of them equally long, and none drawn.
     Raises `TerrainError` for an unknown kind or robot, or for none.
     """
+    check_arguments(lay_course, locals(), TerrainError)
     if robot not in SCALES or not kinds or not set(kinds) <= OBSTACLES.keys():
         raise TerrainError(
             f"cannot lay {', '.join(kinds) or 'nothing'} for {robot!r}: choose of "

@@ -23,7 +23,13 @@ from fgtutor.cloudfiles import Points
 from fgtutor.errors import CloudError, ConfigError
 from fgtutor.robots.a1_model import STANCE, STANCE_HEIGHT, add_box, build_spec
 from fgtutor.terrain import Terrain, boxes_from_elevation
-from fgtutor.validation import Ascending, NonNegative, Positive, check_fields
+from fgtutor.validation import (
+    Ascending,
+    NonNegative,
+    Positive,
+    check_arguments,
+    check_fields,
+)
 
 MOST_RAYS = 10_000_000
 """Rays from one pose; each takes some 100 bytes."""
@@ -31,6 +37,8 @@ Latitude = Annotated[float, Interval(ge=-90, le=90)]
 """An angle against the horizontal, degrees."""
 Noise = Annotated[float, Interval(ge=0, le=100)]
 """A standard deviation, m or degrees."""
+Length = Annotated[float, Interval(ge=0.01, le=1000)]
+"""A height or a distance of poses, m."""
 Poses = Float[np.ndarray, "poses 6"]
 
 SPIN, SWEEP = 397.21, 7.0711
@@ -94,7 +102,7 @@ def pattern(
 
 
 def survey(
-    terrain: Terrain, *, height: float = 1.2, spacing: float = 0.2, lines: float = 2.0
+    terrain: Terrain, *, height: Length = 1.2, spacing: Length = 0.2, lines: Length = 2.0
 ) -> Poses:
     """Return poses on lines along x over the whole terrain, as if carried on a pole.
 
@@ -102,6 +110,7 @@ def survey(
     straight down: a narrow gap shows its ground only from above. `height` is above the highest
     ground, `spacing` along a line and `lines` between two of them, m.
     """
+    check_arguments(survey, locals(), ConfigError)
     x0, y0, x1, y1 = terrain.elevation.extent
     top = float(np.nanmax(terrain.elevation.heights))
     along = max(math.ceil((x1 - x0) / spacing), 1)

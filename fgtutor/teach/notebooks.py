@@ -17,14 +17,16 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+from annotated_types import Interval
 from PIL import Image
 
 from fgtutor.errors import ConfigError, NotebookError
 from fgtutor.robots import ROBOTS
 from fgtutor.specialist import DESCRIPTION, ZOO
 from fgtutor.storage import atomic_write, make_folder
+from fgtutor.validation import check_fields
 
 if TYPE_CHECKING:
     from nbformat import NotebookNode
@@ -237,10 +239,13 @@ class NotebooksConfig:
     """The course: sources in its src, notebooks beside it."""
     out: Path | None = None
     """Where to write; default: the folder itself."""
-    timeout: int = 900
+    timeout: Annotated[int, Interval(ge=1, le=86_400)] = 900
     """Longest time for one cell, s."""
     check: bool = False
     """Execute nothing; say which notebooks are not what their sources give, and fail if any."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def run(config: NotebooksConfig) -> int:
