@@ -33,7 +33,8 @@ from fgtutor.robots.commands import (
 )
 from fgtutor.robots.lanes import Lanes
 from fgtutor.symmetry import Mirror
-from fgtutor.terrain import World
+from fgtutor.terrain import TerrainSeed, World
+from fgtutor.validation import Count, check_arguments
 
 
 def plain_tensors(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -76,15 +77,14 @@ class LocomotionEnv(VecEnv):
     def __init__(
         self,
         world: World,
-        num_envs: int,
+        num_envs: Count,
         *,
         config: EnvConfig | None = None,
-        seed: int = 0,
+        seed: TerrainSeed = 0,
         device: str = "cpu",
     ) -> None:
         """Prepare buffers; the subclass builds its physics, then calls `reset_all`."""
-        if num_envs < 1:
-            raise ConfigError(f"num_envs must be at least 1, got {num_envs}")
+        check_arguments(LocomotionEnv.__init__, locals(), ConfigError)
         self.world, self.num_envs, self.device = world, num_envs, device
         self.config = config or self.episodes
         self.cfg = self.config
@@ -279,7 +279,15 @@ class LocomotionEnv(VecEnv):
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take over a stored curriculum and random stream; call `reset_all` afterwards."""
+        """Take over a stored curriculum and random stream; call `reset_all` afterwards.
+
+        Raises `ValueError` if there is no such row or column here.
+        """
+        for name, number in zip(("row", "column"), self.offsets.shape, strict=False):
+            value, own = state[name], getattr(self, name)
+            fits = (value.shape, value.dtype) == (own.shape, own.dtype)
+            if not (fits and ((value >= 0) & (value < number)).all()):
+                raise ValueError(f"the {name} of each robot should be one of {number}")
         self.row, self.column = state["row"].clone(), state["column"].clone()
         self.random.set_state(state["random"])
 

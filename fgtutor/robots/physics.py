@@ -10,17 +10,21 @@ threads.
 # pyright: reportAttributeAccessIssue=false
 
 import warnings
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
 import torch
+from annotated_types import Interval
 from jaxtyping import Float64, Int64
 from mujoco import batch
 from torch import Tensor
 
 from fgtutor.errors import ConfigError, SimulationError
+from fgtutor.validation import Count, check_arguments
 
+Threads = Annotated[int, Interval(ge=0, le=256)]
+"""Threads of one process, or 0 for one per core."""
 BAD_STATE = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -41,16 +45,12 @@ class Physics:
     takes this one's place. Observations and rewards are torch code that knows neither.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_sims: int, *, threads: int = 0) -> None:
+    def __init__(self, model: mujoco.MjModel, num_sims: Count, *, threads: Threads = 0) -> None:
         """Start every simulation at the model's first keyframe, or at its defaults.
 
         `threads` 0 means one per core. Raises `ConfigError` if a count makes no sense.
         """
-        if num_sims < 1 or threads < 0:
-            raise ConfigError(
-                f"Physics needs num_sims >= 1 and threads >= 0 (0: one per core), "
-                f"got {num_sims} and {threads}"
-            )
+        check_arguments(Physics.__init__, locals(), ConfigError)
         self.model = model
         # One MjData each costs memory (0.2 MB, or 0.5 MB with 2,500 boxes), but lets the terrain
         # sleep, and a step continues from what the last one computed at its end.
