@@ -95,3 +95,7 @@ class ReportError(FgtutorError):
 
 class ExportError(FgtutorError):
     """An exported network does not answer as the policy it was made from."""
+
+
+class TooLargeError(FgtutorError):
+    """What was asked for needs more memory than this machine has left."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from fgtutor.directions import NUM_HEADINGS
 from fgtutor.errors import PlanningError
+from fgtutor.validation import numbers
 
 Array = TypeVar("Array", Tensor, np.ndarray)
 
@@ -31,7 +32,7 @@ def fuse(
         raise PlanningError(
             "fuse needs at least one feasibility tensor, got none: add a specialist"
         )
-    arrays = [np.asarray(t.detach().cpu() if isinstance(t, Tensor) else t) for t in tensors]
+    arrays = [numbers(f"tensor {i}", one, PlanningError) for i, one in enumerate(tensors)]
     if arrays[0].ndim != 3 or arrays[0].shape[-1] != NUM_HEADINGS or not arrays[0].size:
         raise PlanningError(
             f"tensor 0 has shape {arrays[0].shape}, expected (nx, ny, {NUM_HEADINGS}): pass what "
@@ -42,12 +43,6 @@ def fuse(
             raise PlanningError(
                 f"tensor {index} has shape {array.shape}, the first has {arrays[0].shape}: "
                 "tensorize every specialist on the same map"
-            )
-        if array.dtype.kind not in "fiub":
-            raise PlanningError(f"tensor {index} holds {array.dtype}, expected numbers")
-        if not np.isfinite(array).all():
-            raise PlanningError(
-                f"tensor {index} holds NaN or infinity: check that specialist's Feasibility-Net"
             )
         if array.min() < 0 or array.max() > 1:
             raise PlanningError(

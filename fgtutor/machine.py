@@ -1,14 +1,22 @@
 """What the machine lets this process use, where a container or a batch system gives it less.
 
-Reads the scheduler's affinity and the quotas of Linux's control groups, versions 1 and 2; gives a
-number of cores. Sources: sched_getaffinity(2); the kernel's cgroup-v2 "cpu.max" and cgroup-v1
-"cpu.cfs_quota_us".
+Reads the scheduler's affinity, free memory, and the limits of Linux's control groups, versions 1
+and 2; gives a number of cores and of bytes. Sources: sched_getaffinity(2); the kernel's cgroup-v2
+"cpu.max" and "memory.max", and cgroup-v1 "cpu.cfs_quota_us" and "memory.limit_in_bytes".
 """
 
 import math
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+
+import psutil
+
+from fgtutor.errors import TooLargeError
+
+ALWAYS_LEFT = 2**28
+"""Bytes that any machine has left; for fewer, nothing is read (a confined process may not)."""
 
 
 def usable_cores(root: Path = Path("/")) -> int:
@@ -22,8 +30,46 @@ def usable_cores(root: Path = Path("/")) -> int:
     return max(1, cores if quota >= cores else math.ceil(quota))
 
 
+def available_memory(root: Path = Path("/")) -> int:
+    """Return how many bytes this process can still take, by the system, its groups and `ulimit`.
+
+    `root` is where the kernel's files are found, for tests.
+    """
+    rooms = [psutil.virtual_memory().available]
+    rooms += [room for group in _groups(root, "memory") for room in _room(group)]
+    with suppress(ImportError):  # Windows has no such limits
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            rooms.append(limit - psutil.Process().memory_info().vms)
+    return max(0, min(rooms))
+
+
+def require_memory(needed: float, what: str, cure: str, *, fits: bool = True) -> None:
+    """Raise `TooLargeError` if `what` needs more bytes than are left, before it takes them.
+
+    Linux kills a process that takes too much without a word. `fits` says that nothing else forbids
+    the size.
+    """
+    if needed < ALWAYS_LEFT and fits:
+        return
+    left = available_memory()
+    if needed > left or not fits:
+        raise TooLargeError(
+            f"{what} needs about {needed / 1e9:.3g} GB of memory, and {left / 1e9:.3g} GB are left"
+            f"{'' if fits else '; it is too large for the search too'}: {cure}"
+        )
+
+
 def _quotas(root: Path) -> Iterator[float]:
     """Yield every CPU quota above this process, in cores."""
+    for group in _groups(root, "cpu"):
+        yield from _quota(group)
+
+
+def _groups(root: Path, controller: str) -> Iterator[Path]:
+    """Yield the folder of every control group above this process that may limit something."""
     top = root / "sys/fs/cgroup"
     try:
         entries = (root / "proc/self/cgroup").read_text().splitlines()
@@ -31,13 +77,26 @@ def _quotas(root: Path) -> Iterator[float]:
         return
     for entry in entries:
         _, controllers, path = entry.split(":", 2)
-        if controllers and "cpu" not in controllers.split(","):
+        if controllers and controller not in controllers.split(","):
             continue
-        for mount in (top / controllers, top / ("cpu" if controllers else "unified")):
+        for mount in (top / controllers, top / (controller if controllers else "unified")):
             # A container sees its own group at the mount, though its path may be the host's.
             group = mount / path.strip("/")
-            for folder in (group, *group.parents):
-                yield from _quota(folder)
+            yield from (group, *group.parents)
+
+
+def _room(group: Path) -> Iterator[int]:
+    """Yield the bytes that a group may still take, if it has a limit; its file cache gives way."""
+    for limit, usage, cache in (
+        ("memory.max", "memory.current", "inactive_file"),
+        ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    ):
+        try:
+            room = int((group / limit).read_text()) - int((group / usage).read_text())
+            stat = (group / "memory.stat").read_text()
+            yield room + int(dict(line.split() for line in stat.splitlines())[cache])
+        except (OSError, ValueError, KeyError):  # "max" says that there is none
+            continue
 
 
 def _quota(group: Path) -> Iterator[float]:

@@ -6,22 +6,22 @@ Source: paper, Sec. III-C (edge cost 1 / F_max, policy by Eq. 7). The switching 
 paper names its absence as a limit of the method.
 
 Every cell is a node, and F_max[ix, iy, k] >= f_min makes an edge to the neighbour along heading k.
-`as_networkx` builds that graph for reading; for speed, `Planner` hands the same graph to scipy and
-searches it once, backwards from the goal.
+`graphs` builds that graph twice: for reading in networkx, and for speed in scipy, which `Planner`
+searches once, backwards from the goal.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal, get_args
 
 import networkx
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.sparse import csgraph, csr_array
+from scipy.sparse import csgraph
 
 from fgtutor import directions
 from fgtutor.elevation import ElevationMap
@@ -33,12 +33,27 @@ from fgtutor.errors import (
     UnknownCellError,
     UnreachableError,
 )
+from fgtutor.graphs import (
+    CURE,
+    READABLE_STEP,
+    as_networkx,
+    as_switching_networkx,
+    reversed_graph,
+    step_cost,
+    steps_of,
+)
+from fgtutor.grid import coordinate_text, point_text
+from fgtutor.machine import require_memory
 from fgtutor.routes import Route
+from fgtutor.validation import NonNegative, Positive, check_fields, numbers
 
 __all__ = ["Planner", "Route", "as_networkx", "as_switching_networkx", "plan"]
 
 Cell = tuple[int, int]
 Point = tuple[float, float]
+Backend = Literal["auto", "networkx", "scipy"]
+Cost = Literal["inverse", "length"]
+Unknown = Literal["block", "fill"]
 
 
 def plan(
@@ -48,14 +63,14 @@ def plan(
     grid: ElevationMap,
     start: Point,
     goal: Point,
-    backend: str = "auto",
-    cost: str = "inverse",
-    f_min: float = 0.1,
-    switch_cost: float = 0.0,
+    backend: Backend = "auto",
+    cost: Cost = "inverse",
+    f_min: Positive = 0.1,
+    switch_cost: NonNegative = 0.0,
     tensors: Sequence[ArrayLike] | None = None,
     ood: Sequence[ArrayLike] | None = None,
     names: Sequence[str] | None = None,
-    unknown: str = "block",
+    unknown: Unknown = "block",
 ) -> Route:
     """Return the cheapest route from `start` to `goal`, points (x, y) in metres.
 
@@ -67,7 +82,10 @@ def plan(
         UnreachableError: No chain of edges joins them.
         ConfigError: A setting has a value without meaning.
         PlanningError: An array does not fit the map.
+        TooLargeError: The graph does not fit into memory.
     """
+    if backend not in get_args(Backend):
+        raise ConfigError(f"backend must be one of {', '.join(get_args(Backend))}, got {backend!r}")
     planner = Planner(
         fused=fused,
         policy_map=policy_map,
@@ -80,68 +98,10 @@ def plan(
         names=names,
         unknown=unknown,
     )
-    _choose("backend", backend, ("auto", "networkx", "scipy"))
     if backend == "networkx":
         return planner.search_networkx(start, goal)
-    planner.cell_of(start, "start")  # an unusable start need not wait for the search
+    usable_cell(grid, start, "start", unknown)  # an unusable start need not wait for the search
     return planner.towards(goal).route(start)
-
-
-def as_networkx(
-    fused: Float[np.ndarray, "nx ny 8"],
-    policy_map: Int[np.ndarray, "nx ny 8"],
-    *,
-    f_min: float = 0.1,
-    cost: str = "inverse",
-    resolution: float = 1.0,
-) -> networkx.DiGraph:
-    """Build the graph the paper describes: node (ix, iy), one edge for every feasible step.
-
-    Edges carry `weight`, `heading`, `policy` and `feasibility`. `resolution` (m) matters only for
-    `cost="length"`.
-    """
-    graph = networkx.DiGraph()
-    graph.add_nodes_from(np.ndindex(fused.shape[:2]))
-    for ix, iy, heading in np.argwhere(fused >= f_min).tolist():
-        dx, dy = directions.STEPS[heading].tolist()
-        neighbour = (ix + dx, iy + dy)
-        if neighbour in graph:
-            feasibility = float(fused[ix, iy, heading])
-            graph.add_edge(
-                (ix, iy),
-                neighbour,
-                weight=float(_step_cost(feasibility, heading, cost, resolution)),
-                heading=heading,
-                policy=int(policy_map[ix, iy, heading]),
-                feasibility=feasibility,
-            )
-    return graph
-
-
-def as_switching_networkx(
-    tensors: Float[np.ndarray, "policies nx ny 8"],
-    switch_cost: float,
-    *,
-    f_min: float = 0.1,
-    cost: str = "inverse",
-    resolution: float = 1.0,
-) -> networkx.DiGraph:
-    """Build the graph whose node (ix, iy, policy) also remembers which policy led to the cell.
-
-    A step with another policy costs `switch_cost` more, and exists only where both are feasible.
-    """
-    graph = networkx.DiGraph()
-    for new, tensor in enumerate(tensors):
-        one_policy = as_networkx(
-            tensor, np.full(tensor.shape, new), f_min=f_min, cost=cost, resolution=resolution
-        )
-        graph.add_nodes_from((*cell, new) for cell in one_policy)
-        for tail, head, edge in one_policy.edges(data=True):
-            for old, old_tensor in enumerate(tensors):
-                if old_tensor[(*tail, edge["heading"])] >= f_min:
-                    weight = edge["weight"] + switch_cost * (old != new)
-                    graph.add_edge((*tail, old), (*head, new), **edge | {"weight": weight})
-    return graph
 
 
 @dataclass(kw_only=True, eq=False)
@@ -154,11 +114,11 @@ class Planner:
     """P [nx, ny, 8], from `fusion.fuse`."""
     grid: ElevationMap
     """The map that was tensorized."""
-    cost: str = "inverse"
+    cost: Cost = "inverse"
     """Edge cost: "inverse" is 1 / F (the paper), "length" is that times the step's metres."""
-    f_min: float = 0.1
+    f_min: Positive = 0.1
     """Edges with a lower F do not exist; above 0."""
-    switch_cost: float = 0.0
+    switch_cost: NonNegative = 0.0
     """Cost of changing the policy, in the unit of `cost`; above 0 the search needs `tensors`, and
     the policy changes only for a step that the old and the new policy can both take."""
     tensors: Sequence[ArrayLike] | None = None
@@ -167,43 +127,53 @@ class Planner:
     """w_ood [nx, ny, 8] of every policy, for explanations only."""
     names: Sequence[str] | None = None
     """Names of the policies; default: "policy 0" and so on."""
-    unknown: str = "block"
+    unknown: Unknown = "block"
     """What to do with unknown cells: "block" closes them, "fill" trusts the tensors there."""
 
     def __post_init__(self) -> None:
-        _choose("cost", self.cost, ("inverse", "length"))
-        _choose("unknown", self.unknown, ("block", "fill"))
-        if not (math.isfinite(self.f_min) and self.f_min > 0):
-            raise ConfigError(f"f_min must be above 0 (an edge costs 1 / F), got {self.f_min}")
-        if not (math.isfinite(self.switch_cost) and self.switch_cost >= 0):
-            raise ConfigError(f"switch_cost must be finite and >= 0, got {self.switch_cost}")
+        check_fields(self)
         if self.switch_cost > 0 and self.tensors is None:
             raise ConfigError("switch_cost > 0 needs the F_i of all policies: tensors=[F_1, ...]")
+        lists = {"tensors": self.tensors, "ood": self.ood, "names": self.names}
+        given = {what: len(one) for what, one in lists.items() if one is not None}
+        # What is given is stacked, and the layers that are searched are made of it.
+        arrays = 4 + 2 * given.get("tensors", 0) + given.get("ood", 0)
+        each = self.grid.heights.size * directions.NUM_HEADINGS * 8
+        require_memory(arrays * each, f"planning over {_size(self.grid)}", CURE)
         self._fused = self._fit("fused", [self.fused])[0]
-        self._policy_map = self._fit("policy_map", [self.policy_map])[0].astype(np.int64)
+        policy_map = self._fit("policy_map", [self.policy_map])[0]
+        self._policy_map = policy_map.astype(np.int64, copy=False)
+        if (policy_map != self._policy_map).any():
+            raise ConfigError("policy_map holds fractions: give each policy's index, as fuse does")
         self._tensors = None if self.tensors is None else self._fit("tensors", self.tensors)
         self._ood = None if self.ood is None else self._fit("ood", self.ood)
-        count = len(self._tensors) if self._tensors is not None else self._policy_map.max() + 1
-        self._names = tuple(self.names or (f"policy {i}" for i in range(count)))
-        if self._policy_map.min() < 0 or not self._policy_map.max() < count <= len(self._names):
+        low, high = int(self._policy_map.min()), int(self._policy_map.max())
+        if low < 0 or len(set(given.values())) > 1 or high >= min(given.values(), default=high + 1):
+            counts = ", ".join(f"{number} {what}" for what, number in given.items())
             raise PlanningError(
-                f"P holds policies {self._policy_map.min()} to {self._policy_map.max()}, with "
-                f"{count} tensors and {len(self._names)} names: give one of each for every policy"
+                f"P holds policies {low} to {high}, with {counts or 'nothing else'} given: "
+                "policies count from 0, give one of each for every policy"
             )
+        count = min(given.values(), default=high + 1)
+        names = (f"policy {i}" for i in range(count)) if self.names is None else self.names
+        self._names = tuple(names)
+        texts = all(isinstance(name, str) for name in self._names)
+        if not texts or isinstance(self.names, str) or len(set(self._names)) < len(self._names):
+            raise ConfigError(f"each policy needs a name of its own, got {self.names!r}")
 
     def _fit(self, name: str, arrays: Sequence[ArrayLike]) -> np.ndarray:
-        """Stack arrays in float64, or raise `PlanningError` if they do not fit the map."""
+        """Stack arrays, or raise `PlanningError` if they do not fit the map."""
+        if not len(arrays):
+            raise PlanningError(f"{name} is empty: give one array for every policy")
         shape = (*self.grid.shape, directions.NUM_HEADINGS)
-        stacked = [np.asarray(array) for array in arrays]
-        for array in stacked:
+        each = [numbers(name, array, PlanningError) for array in arrays]
+        for array in each:
             if array.shape != shape:
                 raise PlanningError(
                     f"{name}: expected shape {shape} from the map, got {array.shape}; "
                     "tensorize and plan on the same map"
                 )
-            if not np.isfinite(array).all():
-                raise PlanningError(f"{name} holds NaN or infinity: check the Feasibility-Nets")
-        return np.stack(stacked).astype(np.float64)
+        return np.stack(each)
 
     @cached_property
     def layers(self) -> Float[np.ndarray, "layers nx ny 8"]:
@@ -214,21 +184,20 @@ class Planner:
         layers = self._fused[None]
         if self.switch_cost > 0 and self._tensors is not None:
             layers = self._tensors
+        layers = layers.astype(np.result_type(layers.dtype, np.float32), copy=False)
         usable = self.grid.known | (self.unknown == "fill")
         allowed = np.zeros(self._fused.shape, dtype=bool)
-        for heading, tail, head in _steps(self.grid.shape):
+        for heading, tail, head in steps_of(self.grid.shape):
             allowed[(*tail, heading)] = usable[tail] & usable[head]
-        return np.where(allowed & (layers >= self.f_min), layers, 0.0)
+        return np.where(allowed & (layers >= np.float64(self.f_min)), layers, layers.dtype.type(0))
 
     def towards(self, goal: Point) -> Tree:
         """Search backwards from the goal to every cell, with scipy."""
-        tail, head, weight = self._edges()
-        states = self.layers[..., 0].size
-        # Rows of the matrix are where an edge starts: swapping tail and head reverses the search.
-        reverse = csr_array((weight, (head, tail)), shape=(states, states))
+        end = self.cell_of(goal, "goal")
+        reverse = reversed_graph(self.layers, self.switch_cost, self.cost, self.grid.resolution)
         distance, towards, _ = csgraph.dijkstra(
             reverse,
-            indices=self._states(self.cell_of(goal, "goal")),
+            indices=self._states(end),
             return_predecessors=True,
             min_only=True,
         )
@@ -240,6 +209,9 @@ class Planner:
         if ends[0] == ends[1]:
             return self._route([self._states(ends[0])[0]])
         self._check_open(start, goal)
+        steps = int(np.count_nonzero(self.layers)) * len(self.layers)
+        cure = f'{CURE}, or with backend="scipy"'
+        require_memory(steps * READABLE_STEP, f"a networkx graph of {_size(self.grid)}", cure)
         settings = {"f_min": self.f_min, "cost": self.cost, "resolution": self.grid.resolution}
         many = len(self.layers) > 1
         if many:
@@ -261,23 +233,6 @@ class Planner:
         cells = np.ravel_multi_index((layer, nodes[:, 0], nodes[:, 1]), self.layers.shape[:3])
         return self._route(cells)
 
-    def _edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """List tail, head and weight of every edge between states (layer, ix, iy), flattened."""
-        states = np.arange(self.layers[..., 0].size).reshape(self.layers.shape[:3])
-        tails, heads, weights = [], [], []
-        for heading, tail, head in _steps(self.grid.shape):
-            for new, layer in enumerate(self.layers):
-                feasibility = layer[(*tail, heading)]
-                for old, old_layer in enumerate(self.layers):
-                    edge = (feasibility > 0) & (old_layer[(*tail, heading)] > 0)
-                    tails.append(states[old][tail][edge])
-                    heads.append(states[new][head][edge])
-                    weights.append(
-                        _step_cost(feasibility[edge], heading, self.cost, self.grid.resolution)
-                        + self.switch_cost * (old != new)
-                    )
-        return np.concatenate(tails), np.concatenate(heads), np.concatenate(weights)
-
     def _states(self, cell: Cell) -> list[int]:
         """Return the states of a cell, one a layer."""
         cells = self.grid.heights.size
@@ -285,8 +240,10 @@ class Planner:
         return [layer * cells + flat for layer in range(len(self.layers))]
 
     def _route(self, states: ArrayLike) -> Route:
-        """Tell the story of a chain of states."""
+        """Tell the story of a chain of states; of a cell's states the first one came there."""
         layer, ix, iy = np.unravel_index(np.asarray(states), self.layers.shape[:3])
+        came = np.append(True, (np.diff(ix) != 0) | (np.diff(iy) != 0))
+        layer, ix, iy = layer[came], ix[came], iy[came]
         cells = np.stack((ix, iy), axis=-1)
         match = (np.diff(cells, axis=0)[:, None] == directions.STEPS).all(axis=-1)
         headings = match.argmax(axis=-1)
@@ -294,7 +251,7 @@ class Planner:
         x, y = self.grid.centres
         many = len(self.layers) > 1
         feasibility = self.layers[(layer[1:], *at)]
-        costs = _step_cost(feasibility, headings, self.cost, self.grid.resolution)
+        costs = step_cost(feasibility, headings, self.cost, self.grid.resolution)
         return Route(
             cells=cells,
             xy=np.stack((x[ix], y[iy]), axis=-1),
@@ -310,20 +267,7 @@ class Planner:
 
     def cell_of(self, point: Point, role: str) -> Cell:
         """Return the cell of the start or goal, or say why it cannot be one."""
-        x, y = point
-        if not self.grid.contains(x, y):
-            x0, y0, x1, y1 = self.grid.extent
-            raise OffMapError(
-                f"the {role} ({x:g}, {y:g}) m is off the map, which covers x {x0:g}..{x1:g} m and "
-                f"y {y0:g}..{y1:g} m: move the {role} inside, or load a larger map"
-            )
-        cell = self.grid.cell_of(x, y)
-        if self.unknown == "block" and not self.grid.known[cell]:
-            raise UnknownCellError(
-                f"the {role} ({x:g}, {y:g}) m lies on cell {cell}, which was never observed: move "
-                f'the {role}, scan that place, or trust filled heights with unknown="fill"'
-            )
-        return cell
+        return usable_cell(self.grid, point, role, self.unknown)
 
     def _check_open(self, start: Point, goal: Point) -> None:
         """Raise unless some step leaves the start and some step enters the goal."""
@@ -333,23 +277,26 @@ class Planner:
         if not leaving[cell].any():
             best = int(self._fused[cell].argmax())
             raise InfeasibleCellError(
-                f"no policy can leave the start ({start[0]:g}, {start[1]:g}) m, cell {cell}: its "
+                f"no policy can leave the start {self._text(start)} m, cell {cell}: its "
                 f"best F_max is {self._fused[cell][best]:.3g}, towards {directions.NAMES[best]}; "
                 f"move the start, {cure}"
             )
         entered = np.zeros(self.grid.shape, dtype=bool)
-        for heading, tail, head in _steps(self.grid.shape):
+        for heading, tail, head in steps_of(self.grid.shape):
             entered[head] |= leaving[(*tail, heading)] > 0
         if not entered[end]:
             raise InfeasibleCellError(
-                f"no policy can enter the goal ({goal[0]:g}, {goal[1]:g}) m, cell {end}, from any "
+                f"no policy can enter the goal {self._text(goal)} m, cell {end}, from any "
                 f"of its neighbours; move the goal, {cure}"
             )
 
+    def _text(self, point: Point) -> str:
+        return point_text(point, self.grid.resolution)
+
     def _unreachable(self, start: Point, goal: Point) -> UnreachableError:
         return UnreachableError(
-            f"start ({start[0]:g}, {start[1]:g}) m, cell {self.grid.cell_of(*start)}, and goal "
-            f"({goal[0]:g}, {goal[1]:g}) m, cell {self.grid.cell_of(*goal)}, can both be used, but "
+            f"start {self._text(start)} m, cell {self.grid.cell_of(*start)}, and goal "
+            f"{self._text(goal)} m, cell {self.grid.cell_of(*goal)}, can both be used, but "
             f"no chain of steps with F >= {self.f_min:g} joins them: lower f_min, move one of them "
             "or add a specialist (tensorization.why_blocked names what closes a cell)"
         )
@@ -387,25 +334,32 @@ class Tree:
         return planner._route(states)
 
 
-def _steps(shape: tuple[int, int]) -> Iterator[tuple[int, tuple, tuple]]:
-    """Give for every heading the cells that have a neighbour there, and those neighbours."""
-    for heading, step in enumerate(directions.STEPS.tolist()):
-        tail = tuple(slice(max(-d, 0), n - max(d, 0)) for d, n in zip(step, shape, strict=True))
-        head = tuple(slice(max(d, 0), n - max(-d, 0)) for d, n in zip(step, shape, strict=True))
-        yield heading, tail, head
+def usable_cell(grid: ElevationMap, point: Point, role: str, unknown: Unknown = "block") -> Cell:
+    """Return the cell of the start or goal (`role`), or say why it cannot be one.
+
+    Raises:
+        OffMapError, UnknownCellError: The point is off the map, or was never observed.
+        ConfigError: It is no point.
+    """
+    try:
+        x, y = (float(value) for value in point)
+    except (TypeError, ValueError):
+        raise ConfigError(f"the {role} must be a point (x, y) in metres, got {point!r}") from None
+    place = f"the {role} {point_text((x, y), grid.resolution)} m"
+    if not grid.contains(x, y):
+        x0, y0, x1, y1 = (coordinate_text(value, grid.resolution) for value in grid.extent)
+        raise OffMapError(
+            f"{place} is off the map, which covers x {x0}..{x1} m and y {y0}..{y1} m: move the "
+            f"{role} inside, or load a larger map"
+        )
+    cell = grid.cell_of(x, y)
+    if unknown == "block" and not grid.known[cell]:
+        raise UnknownCellError(
+            f"{place} lies on cell {cell}, which was never observed: move the {role}, scan that "
+            'place, or trust filled heights with unknown="fill"'
+        )
+    return cell
 
 
-def _step_cost(
-    feasibility: ArrayLike, heading: int | np.ndarray, cost: str, resolution: float
-) -> np.ndarray:
-    """Return 1 / F, times the step's length in metres for `cost="length"`."""
-    inverse = 1.0 / np.asarray(feasibility, dtype=np.float64)
-    if cost == "inverse":
-        return inverse
-    return inverse * directions.STEP_LENGTHS[heading] * resolution
-
-
-def _choose(setting: str, value: str, choices: tuple[str, ...]) -> None:
-    """Raise `ConfigError` unless `value` is one of `choices`."""
-    if value not in choices:
-        raise ConfigError(f"{setting} must be one of {', '.join(choices)}, got {value!r}")
+def _size(grid: ElevationMap) -> str:
+    return f"{grid.shape[0]} x {grid.shape[1]} cells"

@@ -106,6 +106,25 @@ def _check(kind: Callable[..., Any], values: Mapping[str, Any], error: type[Fgtu
             raise error(f"{name}: {_first(problem)}") from None
 
 
+def numbers(name: str, values: Any, error: type[FgtutorError]) -> np.ndarray:
+    """Return an array, tensor or nested list as a numpy array, if it holds finite numbers only.
+
+    A tensor is taken from its device and its gradient. Raises `error`, which says `name`.
+    """
+    given = values.detach().cpu() if hasattr(values, "detach") else values
+    try:
+        array = np.asarray(given)
+    except (TypeError, ValueError) as problem:
+        raise error(f"{name} is no array of numbers: {problem}") from None
+    if array.dtype.kind not in "fiub":
+        raise error(f"{name} holds {array.dtype}, expected real numbers")
+    if np.ma.is_masked(given):
+        raise error(f"{name} has masked values: give each a number first (numpy.ma.filled)")
+    if not np.isfinite(array).all():
+        raise error(f"{name} holds NaN or infinity: check the Feasibility-Nets that it came from")
+    return array
+
+
 def parse_options(kind: type[T], words: Sequence[str], program: str, default: T | None = None) -> T:
     """Return the `kind` that a command line's words fill, from `default` if there is one.
 

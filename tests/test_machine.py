@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from fgtutor import machine
-from fgtutor.machine import usable_cores
+from fgtutor.errors import TooLargeError
+from fgtutor.machine import available_memory, require_memory, usable_cores
 
 
 @pytest.mark.parametrize(
@@ -55,3 +56,44 @@ def test_the_smallest_quota_decides(tmp_path: Path, monkeypatch, files, cores):
 
 def test_this_machine_gives_a_core_and_no_more_than_it_has():
     assert 1 <= usable_cores() <= (os.cpu_count() or 1)
+
+
+@pytest.mark.parametrize(
+    ("files", "left"),
+    [
+        ({}, 8e9),
+        ({"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/memory.max": "max\n"}, 8e9),
+        # Files that the kernel keeps in memory give way: 3 GB less 1.5 GB, plus 0.5 GB.
+        (
+            {
+                "proc/self/cgroup": "0::/a\n",
+                "sys/fs/cgroup/a/memory.max": "3000000000\n",
+                "sys/fs/cgroup/a/memory.current": "1500000000\n",
+                "sys/fs/cgroup/a/memory.stat": "anon 1000000000\ninactive_file 500000000\n",
+            },
+            2e9,
+        ),
+        (
+            {
+                "proc/self/cgroup": "4:memory:/x\n3:cpu,cpuacct:/docker/123\n",
+                "sys/fs/cgroup/memory/memory.limit_in_bytes": "1000000000\n",
+                "sys/fs/cgroup/memory/memory.usage_in_bytes": "1200000000\n",
+                "sys/fs/cgroup/memory/memory.stat": "total_inactive_file 0\n",
+            },
+            0,
+        ),
+    ],
+)
+def test_the_smallest_room_of_memory_decides(tmp_path: Path, monkeypatch, files, left):
+    free = machine.psutil.virtual_memory()._replace(available=int(8e9))
+    monkeypatch.setattr(machine.psutil, "virtual_memory", lambda: free)
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert available_memory(tmp_path) == left
+
+
+def test_what_needs_more_memory_than_there_is_says_what_to_do():
+    require_memory(1e6, "a small map", "crop it")
+    with pytest.raises(TooLargeError, match=r"all of it needs about 1e\+09 GB.*left: crop it"):
+        require_memory(1e18, "all of it", "crop it")

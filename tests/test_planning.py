@@ -1,6 +1,7 @@
 """Planning: costs against networkx, routes known by hand, errors that say what to change."""
 
 import json
+import re
 
 import networkx
 import numpy as np
@@ -9,18 +10,22 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fgtutor import directions
+from fgtutor import directions, machine
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import (
     ConfigError,
     InfeasibleCellError,
     OffMapError,
     PlanningError,
+    TooLargeError,
     UnknownCellError,
     UnreachableError,
 )
 from fgtutor.fusion import fuse
+from fgtutor.graphs import reversed_graph
+from fgtutor.grid import point_text
 from fgtutor.planning import Planner, Route, as_networkx, as_switching_networkx, plan
+from fgtutor.tensorization import steps_on_known
 
 BACKENDS = ("networkx", "scipy")
 RESOLUTION = 0.2
@@ -348,7 +353,7 @@ def test_errors_say_which_end_where_and_what_to_change(backend, cell, error, wor
     with pytest.raises(error, match=words) as caught:
         plan(tensor, np.zeros(tensor.shape), grid=grid, backend=backend, **ends)
     message = str(caught.value)
-    assert role in message and "{:g}, {:g}".format(*ends[role]) in message
+    assert role in message and point_text(ends[role], RESOLUTION) in message
     assert "move" in message
 
 
@@ -367,13 +372,36 @@ def test_unknown_cells_are_never_silently_free(backend):
 @pytest.mark.parametrize(
     ("settings", "error", "words"),
     [
-        ({"f_min": 0.0}, ConfigError, "f_min must be above 0"),
-        ({"f_min": np.nan}, ConfigError, "f_min"),
-        ({"cost": "time"}, ConfigError, "inverse, length"),
+        ({"f_min": 0.0}, ConfigError, "f_min: should be greater than 0"),
+        ({"f_min": np.nan}, ConfigError, "f_min: should be a finite number"),
+        ({"f_min": np.inf}, ConfigError, "f_min: should be a finite number"),
+        ({"f_min": "0.1"}, ConfigError, "f_min: should be a valid number"),
+        ({"cost": "time"}, ConfigError, "'inverse' or 'length'"),
         ({"backend": "astar"}, ConfigError, "auto, networkx, scipy"),
-        ({"unknown": "free"}, ConfigError, "block, fill"),
-        ({"switch_cost": -1.0}, ConfigError, "switch_cost"),
+        ({"unknown": "free"}, ConfigError, "'block' or 'fill'"),
+        ({"switch_cost": -1.0}, ConfigError, "switch_cost: should be greater than or equal to 0"),
+        ({"switch_cost": np.nan}, ConfigError, "switch_cost: should be a finite number"),
+        ({"switch_cost": np.inf}, ConfigError, "switch_cost: should be a finite number"),
         ({"switch_cost": 1.0}, ConfigError, "tensors"),
+        ({"start": (0.0,)}, ConfigError, "the start must be a point"),
+        ({"goal": ("here", 1)}, ConfigError, "the goal must be a point"),
+        ({"goal": (0.0, np.inf)}, OffMapError, "the goal .* is off the map"),
+        ({"names": ["a"]}, PlanningError, "0 to 1, with 1 names"),
+        ({"names": ["a", "b", "c"], "tensors": [np.ones((3, 3, 8))] * 2}, PlanningError, "3 names"),
+        ({"ood": [np.ones((3, 3, 8))], "names": ["a", "b"]}, PlanningError, "1 ood, 2 names"),
+        ({"names": ["a", "a"]}, ConfigError, "a name of its own"),
+        ({"names": "ab"}, ConfigError, "a name of its own"),
+        ({"names": [1, 2]}, ConfigError, "a name of its own"),
+        ({"tensors": []}, PlanningError, "tensors is empty"),
+        ({"policy_map": np.full((3, 3, 8), 0.5)}, ConfigError, "fractions"),
+        ({"fused": np.full((3, 3, 8), 1j)}, PlanningError, "complex"),
+        ({"fused": np.full((3, 3, 8), "1")}, PlanningError, "expected real numbers"),
+        ({"fused": [[1.0], [1.0, 2.0]]}, PlanningError, "no array of numbers"),
+        (
+            {"fused": np.ma.masked_less(np.arange(72.0).reshape(3, 3, 8), 1)},
+            PlanningError,
+            "masked values",
+        ),
         ({"fused": np.ones((3, 4, 8))}, PlanningError, "expected shape"),
         ({"fused": np.full((3, 3, 8), np.nan)}, PlanningError, "NaN"),
         ({"policy_map": np.full((3, 3, 8), 2), "names": ["a"]}, PlanningError, "names"),
@@ -384,13 +412,99 @@ def test_settings_that_cannot_work_are_refused(settings, error, words):
     grid = flat(3, 3)
     usual = {
         "fused": np.ones((3, 3, 8)),
-        "policy_map": np.zeros((3, 3, 8)),
+        "policy_map": np.eye(3)[..., None].repeat(8, axis=-1),
         "grid": grid,
         "start": grid.centre_of(0, 0),
         "goal": grid.centre_of(2, 2),
     }
     with pytest.raises(error, match=words):
         plan(**usual | settings)
+
+
+@pytest.mark.parametrize("origin", [(500000, 4649776), (500000.35, 5648298.15)])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_messages_show_coordinates_to_the_cell_far_from_the_origin(backend, origin):
+    near, moved = one_island()[1], np.add(origin, (1.0, -3.0))
+    far = ElevationMap(near.heights, RESOLUTION, origin=origin, known=near.known)
+    tensor = one_island()[0]
+
+    def message(grid, cell):
+        ends = {"start": grid.centre_of(*cell), "goal": grid.centre_of(1, 1)}
+        with pytest.raises(PlanningError) as caught:
+            plan(tensor, np.zeros(tensor.shape), grid=grid, backend=backend, **ends)
+        return str(caught.value)
+
+    for cell in ((7, 0), (4, 4), (0, 4), (4, 0)):
+        numbers = re.findall(r"\d+\.\d\d", message(far, cell))
+        place = np.add(near.centre_of(*cell), moved)
+        assert numbers[:2] == [f"{value:.2f}" for value in place]
+        assert len(numbers) == len(re.findall(r"\d+\.\d\d", message(near, cell)))
+
+
+def test_tensors_that_carry_a_gradient_plan_as_any_other():
+    grid = flat(7, 3)
+    plain = [torch.from_numpy(tensor).float() for tensor in two_specialists()]
+    carrying = [tensor.clone().requires_grad_() for tensor in plain]
+    routes = []
+    for tensors in (plain, carrying):
+        fused, policy_map = fuse(tensors)
+        routes.append(
+            plan(
+                (fused + 0 * tensors[0]),
+                policy_map,
+                grid=grid,
+                start=grid.centre_of(0, 1),
+                goal=grid.centre_of(6, 1),
+                tensors=tensors,
+                switch_cost=0.5,
+            )
+        )
+    assert routes[0].to_json() == routes[1].to_json()
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("cost", ["inverse", "length"])
+def test_both_switching_graphs_cost_the_same_from_every_cell(seed, cost):
+    """Policies of one kind of ground are nested, others overlap: both ways of changing are met."""
+    tensors, grid, _, goal = random_problem(seed, policies=4)
+    if seed % 2:
+        tensors[1][tensors[0] > 0] = 0.6  # whatever 0 can, 1 can too
+    fused, policy_map = fuse(tensors)
+    settings = {"grid": grid, "switch_cost": 0.7, "cost": cost, "tensors": tensors}
+    planner = Planner(fused=fused, policy_map=policy_map, **settings)
+    tree = planner.towards(goal)
+    graph = as_switching_networkx(planner.layers, 0.7, cost=cost, resolution=RESOLUTION)
+    end = grid.cell_of(*goal)
+    cheapest = networkx.multi_source_dijkstra_path_length(
+        graph.reverse(), [(*end, policy) for policy in range(4)]
+    )
+    for policy, ix, iy in np.ndindex(tree.distance.shape):
+        expected = cheapest.get((ix, iy, policy), np.inf)
+        assert tree.distance[policy, ix, iy] == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_change_of_policy_takes_one_edge_where_the_old_one_can_take_every_step():
+    layers = np.ones((4, 30, 30, 8)) * steps_on_known(np.ones((30, 30), dtype=bool))
+    count = reversed_graph(layers, 1.0, "inverse", 0.1).nnz
+    steps = np.count_nonzero(layers[0])
+    assert count == 4 * steps + 4 * 3 * 900 and count < 0.4 * 4 * 4 * steps
+
+
+@pytest.mark.parametrize(
+    ("backend", "rooms", "what"),
+    [
+        ("scipy", [200_000], "planning over 40 x 40 cells"),
+        ("scipy", [10**6, 200_000], "searching 40 x 40 cells with 12324 edges"),
+        ("networkx", [10**6, 200_000], "a networkx graph of 40 x 40 cells"),
+    ],
+)
+def test_a_map_too_large_for_the_memory_left_is_refused(monkeypatch, backend, rooms, what):
+    monkeypatch.setattr(machine, "ALWAYS_LEFT", 0)
+    monkeypatch.setattr(machine, "available_memory", iter(rooms).__next__)
+    grid, tensor = flat(40, 40), np.ones((40, 40, 8))
+    ends = {"start": grid.centre_of(0, 0), "goal": grid.centre_of(9, 9)}
+    with pytest.raises(TooLargeError, match=rf"{what}.* 0.0002 GB are left: .*crop"):
+        plan(tensor, np.zeros(tensor.shape), grid=grid, backend=backend, **ends)
 
 
 def test_a_route_explains_itself():
