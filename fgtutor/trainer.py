@@ -9,9 +9,7 @@ Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
 
 import contextlib
 import ctypes
-import hashlib
 import io
-import json
 import math
 import time
 from dataclasses import replace
@@ -22,20 +20,14 @@ from typing import Any
 import torch
 
 from fgtutor import distributed
+from fgtutor.checkpoints import CHECKPOINT, foreign, read_checkpoint, write_checkpoint
 from fgtutor.distributed import leads
 from fgtutor.errors import CheckpointError, ConfigError, DivergedError
 from fgtutor.ppo import QUANTILES, FeasibilityPPO
 from fgtutor.recipe import TrainConfig, comparable, make_training_env, runner_config
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.specialist import Specialist, load_specialist, save_specialist
-from fgtutor.storage import atomic_write
 
-CHECKPOINT = "checkpoint.pt"
-"""The file in a run's folder from which it goes on: a sha256, and what torch saves."""
-DIGEST = hashlib.sha256().digest_size
-"""Bytes of the sha256."""
-_PLAIN = "config", "history"
-"""Parts of a checkpoint that are plain values; they are kept as JSON."""
 OUTGROWN = 0.45
 """Share of the way to the last row at which, on the mean, robots have outgrown the first one."""
 LIFT = 0.25
@@ -175,6 +167,11 @@ class Trainer:
 
     def _check_weights(self) -> None:
         """Raise `DivergedError` if a weight of any network is not finite."""
+        if strange := self._strange_weights():
+            raise self._diverged(strange)
+
+    def _strange_weights(self) -> str:
+        """Say which network has weights that are not finite, if one has."""
         nets = {
             "policy": self.algorithm.get_policy(),
             "critic": self.algorithm.critic,
@@ -182,7 +179,8 @@ class Trainer:
         }
         for name, net in nets.items():
             if not all(value.isfinite().all() for value in net.state_dict().values()):
-                raise self._diverged(f"weights of the {name} are not finite")
+                return f"weights of the {name} are not finite"
+        return ""
 
     def _diverged(self, what: str) -> DivergedError:
         how = "--learning-rate, or --feasibility-learning-rate or --context-learning-rate"
@@ -279,8 +277,9 @@ class Trainer:
             raise CheckpointError(f"no checkpoint at {path}: start without --resume")
         state = read_checkpoint(path)
         stored = state["config"]
-        if stored["start_from"] and not self.config.start_from:
-            self.config = replace(self.config, start_from=Path(stored["start_from"]))
+        start = stored.get("start_from")
+        if start and isinstance(start, str) and not self.config.start_from:
+            self.config = replace(self.config, start_from=Path(start))
         mine = comparable(self.config)
         changed = sorted(k for k in mine if k != "iterations" and stored.get(k) != mine[k])
         if changed:
@@ -288,7 +287,7 @@ class Trainer:
             raise CheckpointError(
                 f"{path} belongs to another run: {what}. Use the same settings, or another --out"
             )
-        everyone = [state, *state.get("others", ())]
+        everyone = [state, *state["others"]]
         if len(everyone) != distributed.processes():
             raise CheckpointError(
                 f"{path} was written by {len(everyone)} processes, these are "
@@ -296,14 +295,14 @@ class Trainer:
             )
         try:
             self._take_over(state, everyone[distributed.rank()])
-        except (LookupError, RuntimeError, TypeError, ValueError) as error:
-            raise CheckpointError(
-                f"{path} does not hold what this version keeps ({error}): use another --out"
-            ) from error
+        except Exception as error:  # of rsl_rl, torch and the robots, whatever is in the state
+            raise foreign(path, error) from error
 
     def _take_over(self, state: dict[str, Any], own: dict[str, Any]) -> None:
         """Set everything to what a checkpoint holds, and to what it holds of this process."""
         self.algorithm.load(state["algorithm"])
+        if strange := self._strange_weights():
+            raise ValueError(strange)
         self.samples_before, self.critic_warmup = state["samples_before"], state["critic_warmup"]
         warm = state["iteration"] < self.critic_warmup
         self.algorithm.get_policy().requires_grad_(not warm)
@@ -350,29 +349,3 @@ def give_back_memory() -> None:
     """
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
-
-
-def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint atomically, behind its checksum; raises `StorageError`."""
-    # Through memory: torch's own writer reports a full disk as something else than an OSError.
-    buffer = io.BytesIO()
-    torch.save(state | {name: json.dumps(state[name]) for name in _PLAIN}, buffer)
-    payload = buffer.getvalue()
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(hashlib.sha256(payload).digest() + payload)
-
-
-def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Return what a checkpoint holds; raises `CheckpointError` unless each byte is as written."""
-    try:
-        data = path.read_bytes()
-        payload = data[DIGEST:]
-        if hashlib.sha256(payload).digest() != data[:DIGEST]:
-            raise CheckpointError(
-                f"{path} is damaged, or no checkpoint of this version: begin anew in another "
-                f"--out, --from the newest folder in {path.parent / 'snapshots'} if there is one"
-            )
-    except OSError as error:
-        raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
-    state = torch.load(io.BytesIO(payload), weights_only=True, map_location="cpu")
-    return state | {name: json.loads(state[name]) for name in _PLAIN}

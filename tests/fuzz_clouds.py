@@ -1,16 +1,9 @@
 """The fuzzer's point clouds, what is done to their files, and what is right of them."""
 
 import io
-import os
 import random
-import runpy
 import struct
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 from fuzz_damage import damage_bytes, damage_text, poke, zipped
@@ -29,34 +22,6 @@ def use_cloud(folder: Path) -> None:
     assert points.dtype == np.float64 and points.ndim == 2 and points.shape[1] == 3 and len(points)
     assert np.isfinite(points).all()
     assert map_points(points).count.sum() <= len(points)
-
-
-def use_las(folder: Path) -> None:
-    import laspy
-    import lazrs
-
-    from fgtutor import cloudfiles
-
-    assert laspy and lazrs  # imported before the fork
-    cloudfiles.subprocess = SimpleNamespace(**vars(subprocess) | {"run": run_warm})
-    use_cloud(folder)
-
-
-def run_warm(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
-    """Do what `subprocess.run([python, "-m", module, ...])` does, in a fork: 100 times faster."""
-    with tempfile.TemporaryFile("w+") as errors:
-        if not (child := os.fork()):
-            os.dup2(errors.fileno(), 2)
-            sys.argv = command[command.index("-m") + 1 :]
-            try:
-                runpy.run_module(sys.argv[0], run_name="__main__")
-            except SystemExit as error:
-                os.write(2, str(error.code or "").encode(errors="replace"))
-                os._exit(bool(error.code))
-            os._exit(0)
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        errors.seek(0)
-        return subprocess.CompletedProcess(command, code, "", errors.read())
 
 
 def damage_header(rng: random.Random, data: bytes, other: bytes) -> bytes:
@@ -185,8 +150,8 @@ _LAS = (damage_bytes, damage_las)
 TARGETS = {
     "ply": Target(plys, use_cloud, {".ply": _HEADED}),
     "pcd": Target(pcds, use_cloud, {".pcd": _HEADED}),
-    "las": Target(lambda: las(".las"), use_las, {".las": _LAS}),
-    "laz": Target(lambda: las(".laz"), use_las, {".laz": _LAS}),
+    "las": Target(lambda: las(".las"), use_cloud, {".las": _LAS}),
+    "laz": Target(lambda: las(".laz"), use_cloud, {".laz": _LAS}),
     "xyz": Target(xyzs, use_cloud, {".xyz": (damage_bytes, damage_text)}),
     "cloud": Target(npz_clouds, use_cloud, {".npz": NPZ}),
 }

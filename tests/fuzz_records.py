@@ -159,13 +159,13 @@ def routes() -> list[Case]:
 
 
 def use_route(folder: Path) -> None:
-    from fgtutor.errors import PlanningError
     from fgtutor.routes import Route
 
+    text = (folder / "route.json").read_bytes()
     try:
-        data = json.loads((folder / "route.json").read_bytes())
-    except (OSError, ValueError, RecursionError) as error:  # of Python's own reader
-        raise PlanningError(f"not even JSON: {type(error).__name__}") from None
+        data = json.loads(text)
+    except (ValueError, RecursionError):
+        data = text  # no tree at all
     route = Route.from_json(data)
     assert repr(route) and len(route.explain()) == len(route.cells) - 1
     assert np.isfinite(route.xy).all() and np.isfinite([route.cost, route.length]).all()

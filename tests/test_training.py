@@ -305,7 +305,7 @@ def test_the_command_line_takes_the_robots_own_sizes(words, expected):
     ("change", "message"),
     [
         ({"robot": "a1"}, "robot was 'a1', now 'toy'"),
-        ({"iterations": 6}, r"does not hold what this version keeps \('algorithm'\)"),
+        ({"iterations": 6}, r"does not hold what this version keeps \(KeyError: 'algorithm'\)"),
     ],
 )
 def test_a_checkpoint_that_is_whole_but_does_not_fit_is_refused(trained, tmp_path, change, message):

@@ -1,0 +1,53 @@
+"""Checkpoints that are whole, and hold what no training writes."""
+
+import hashlib
+import math
+
+import pytest
+
+from fgtutor.checkpoints import read_checkpoint, write_checkpoint
+from fgtutor.errors import CheckpointError
+from fgtutor.recipe import TrainConfig
+from fgtutor.trainer import Trainer
+
+
+@pytest.fixture
+def trainer(tmp_path):
+    """A training that has saved its first iteration."""
+    sizes = {"num_envs": 2, "steps": 8, "rows": 1, "columns": 1, "hidden": (4,)}
+    trainer = Trainer(TrainConfig(out=tmp_path, label_seconds=0.12, iterations=2, **sizes))
+    trainer.iterate()
+    trainer.save()
+    return trainer
+
+
+def without_end(state):
+    state["algorithm"]["critic_state_dict"]["mlp.0.bias"] *= math.inf
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda state: state.update(iteration=-1), "iteration: should be greater than or equal"),
+        (lambda state: state.update(easiest=math.nan), "easiest: should be a finite number"),
+        (lambda state: state.update(history=[{"r_v": "x"}]), r"history.0.r_v: .* number, got 'x'"),
+        (lambda state: state.update(config=[]), "config: should be an object"),
+        (lambda state: state.update(others=None), "does not hold what this version keeps"),
+        (lambda state: state["env"].update(row=state["env"]["row"] + 1), "row of each robot"),
+        (lambda state: state["env"].update(column=None), "does not hold what this version keeps"),
+        (without_end, "weights of the critic are not finite"),
+    ],
+)
+def test_values_that_no_training_writes_are_refused(trainer, change, message):
+    state = read_checkpoint(trainer.checkpoint)
+    change(state)
+    write_checkpoint(trainer.checkpoint, state)
+    with pytest.raises(CheckpointError, match=message):
+        trainer.resume()
+
+
+@pytest.mark.parametrize("payload", [b"", b"no archive", b"\x80\x04K\x01.", b"\x80\x02]q\0."])
+def test_bytes_that_torch_cannot_read_are_refused(trainer, payload):
+    trainer.checkpoint.write_bytes(hashlib.sha256(payload).digest() + payload)
+    with pytest.raises(CheckpointError, match="does not hold what this version keeps"):
+        trainer.resume()
