@@ -4,10 +4,11 @@ Reads an elevation map and a zoo; gives a `Plan` that keeps every stage, so that
 curious reader can look at each. Source: paper, Sec. III-B and III-C.
 """
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -15,10 +16,15 @@ from torch import Tensor
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.fusion import fuse
-from fgtutor.planning import Route, plan
+from fgtutor.planning import Backend, Cost, Point, Route, Search, plan, usable_cell
+from fgtutor.progress import QUICK, duration
 from fgtutor.specialist import Specialist, load_zoo
 from fgtutor.storage import check_writable, write_json
 from fgtutor.tensorization import Taus, tensorize_all
+from fgtutor.validation import NonNegative, Positive, Unique, check_fields
+
+SECONDS_PER_STATE = 1.5e-6
+"""What a search takes, in one call that cannot show how far it is (measured, 4 policies)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,39 +46,49 @@ class Plan:
 def plan_on_map(
     elevation: ElevationMap,
     zoo: Mapping[str, Specialist],
-    start: tuple[float, float],
-    goal: tuple[float, float],
+    start: Point,
+    goal: Point,
     *,
     taus: Taus = "calibrated",
-    f_min: float = 0.1,
-    cost: str = "inverse",
-    backend: str = "auto",
-    switch_cost: float = 0.0,
+    f_min: Positive = 0.1,
+    cost: Cost = "inverse",
+    backend: Backend = "auto",
+    switch_cost: NonNegative = 0.0,
     tensors: Mapping[str, Tensor] | None = None,
+    progress: bool = False,
 ) -> Plan:
     """Tensorize `elevation` for every policy of `zoo`, fuse, and plan from `start` to `goal`.
 
-    `tensors` may hold F_i already computed, by name. Raises `ConfigError` for an empty zoo, and
-    whatever the stages raise.
+    `tensors` may hold F_i already computed, by name. `progress` shows a bar if it takes long.
+    Raises `ConfigError` for an empty zoo, and whatever the stages raise, at once where it can be
+    known before the map is tensorized.
     """
     if not zoo:
         raise ConfigError("planning needs at least one specialist, the zoo is empty")
+    search = Search(backend=backend, cost=cost, f_min=f_min, switch_cost=switch_cost)
+    search.check_memory(elevation, len(zoo))
+    for point, role in ((start, "start"), (goal, "goal")):
+        usable_cell(elevation, point, role)
     known = dict(tensors or {})
     known |= tensorize_all(
-        elevation, {name: one for name, one in zoo.items() if name not in known}, taus=taus
+        elevation,
+        {name: one for name, one in zoo.items() if name not in known},
+        taus=taus,
+        progress=progress,
     )
     each = [known[name] for name in zoo]
     fused, policy_map = fuse(each)
+    states = elevation.heights.size * (len(zoo) if switch_cost else 1)
+    if progress and states * SECONDS_PER_STATE > QUICK:
+        expected = duration(states * SECONDS_PER_STATE)
+        print(f"searching the route: about {expected}", file=sys.stderr)
     route = plan(
         fused,
         policy_map,
         grid=elevation,
         start=start,
         goal=goal,
-        backend=backend,
-        cost=cost,
-        f_min=f_min,
-        switch_cost=switch_cost,
+        **vars(search),
         tensors=each,
         names=tuple(zoo),
     )
@@ -85,29 +101,32 @@ class PlanConfig:
 
     map: Path
     """Elevation map: .npz, .tif, or .png with its .yaml."""
-    start: tuple[float, float]
+    start: Point
     """Start x y, m."""
-    goal: tuple[float, float]
+    goal: Point
     """Goal x y, m."""
     robot: str = "toy"
     """Whose specialists plan."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped zoo of the robot."""
-    policies: tuple[str, ...] = ()
+    policies: Annotated[tuple[str, ...], Unique] = ()
     """Use only these specialists; default: all."""
     taus: Literal["paper", "calibrated"] = "calibrated"
     """Thresholds of w_ood: the paper's, or each specialist's own."""
-    f_min: float = 0.1
+    f_min: Positive = 0.1
     """Edges less feasible than this do not exist."""
-    cost: Literal["inverse", "length"] = "length"
+    cost: Cost = "length"
     """Edge cost: 1 / F_max times the step's length, or 1 / F_max alone (the paper)."""
-    switch_cost: float = 0.0
+    switch_cost: NonNegative = 0.0
     """Extra cost of changing the policy, in the unit of `cost` (metres or steps where F is 1); 0 is
     the paper's."""
-    backend: Literal["auto", "networkx", "scipy"] = "auto"
+    backend: Backend = "auto"
     """Which library searches."""
     json: Path | None = None
     """Write the route here."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def choose(zoo: dict[str, Specialist], names: tuple[str, ...]) -> dict[str, Specialist]:
@@ -135,6 +154,7 @@ def run(config: PlanConfig) -> int:
             cost=config.cost,
             backend=config.backend,
             switch_cost=config.switch_cost,
+            progress=True,
         )
     print(planned.route)
     if config.json:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Literal
 
 import networkx
 import numpy as np
@@ -35,7 +35,9 @@ from fgtutor.errors import (
 )
 from fgtutor.graphs import (
     CURE,
+    EDGE,
     READABLE_STEP,
+    STATE,
     as_networkx,
     as_switching_networkx,
     reversed_graph,
@@ -84,12 +86,11 @@ def plan(
         PlanningError: An array does not fit the map.
         TooLargeError: The graph does not fit into memory.
     """
-    if backend not in get_args(Backend):
-        raise ConfigError(f"backend must be one of {', '.join(get_args(Backend))}, got {backend!r}")
     planner = Planner(
         fused=fused,
         policy_map=policy_map,
         grid=grid,
+        backend=backend,
         cost=cost,
         f_min=f_min,
         switch_cost=switch_cost,
@@ -98,14 +99,43 @@ def plan(
         names=names,
         unknown=unknown,
     )
-    if backend == "networkx":
-        return planner.search_networkx(start, goal)
-    usable_cell(grid, start, "start", unknown)  # an unusable start need not wait for the search
-    return planner.towards(goal).route(start)
+    return planner.search(start, goal)
 
 
 @dataclass(kw_only=True, eq=False)
-class Planner:
+class Search:
+    """How a route is searched, whatever the map; checked when it is made."""
+
+    backend: Backend = "auto"
+    """Which library searches."""
+    cost: Cost = "inverse"
+    """Edge cost: "inverse" is 1 / F (the paper), "length" is that times the step's metres."""
+    f_min: Positive = 0.1
+    """Edges with a lower F do not exist; above 0."""
+    switch_cost: NonNegative = 0.0
+    """Cost of changing the policy, in the unit of `cost`; above 0 the search needs `tensors`, and
+    the policy changes only for a step that the old and the new policy can both take."""
+    unknown: Unknown = "block"
+    """What to do with unknown cells: "block" closes them, "fill" trusts the tensors there."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def check_memory(self, grid: ElevationMap, policies: int) -> None:
+        """Raise `TooLargeError` if an open map of this size is too large to plan on.
+
+        Without free memory Linux would end the process, after it has tensorized for minutes.
+        """
+        cells = grid.heights.size
+        layers = policies if self.switch_cost else 1
+        arrays = (4 + 2 * policies) * cells * directions.NUM_HEADINGS * 8
+        edges = cells * layers * (directions.NUM_HEADINGS + layers - 1)
+        search = edges * EDGE + cells * layers * STATE
+        require_memory(arrays + search, f"planning over {_size(grid)} for {policies}", CURE)
+
+
+@dataclass(kw_only=True, eq=False)
+class Planner(Search):
     """Everything a search needs to know, checked once; `towards` a goal it answers many starts."""
 
     fused: ArrayLike
@@ -114,32 +144,20 @@ class Planner:
     """P [nx, ny, 8], from `fusion.fuse`."""
     grid: ElevationMap
     """The map that was tensorized."""
-    cost: Cost = "inverse"
-    """Edge cost: "inverse" is 1 / F (the paper), "length" is that times the step's metres."""
-    f_min: Positive = 0.1
-    """Edges with a lower F do not exist; above 0."""
-    switch_cost: NonNegative = 0.0
-    """Cost of changing the policy, in the unit of `cost`; above 0 the search needs `tensors`, and
-    the policy changes only for a step that the old and the new policy can both take."""
     tensors: Sequence[ArrayLike] | None = None
     """F_i [nx, ny, 8] of every policy."""
     ood: Sequence[ArrayLike] | None = None
     """w_ood [nx, ny, 8] of every policy, for explanations only."""
     names: Sequence[str] | None = None
     """Names of the policies; default: "policy 0" and so on."""
-    unknown: Unknown = "block"
-    """What to do with unknown cells: "block" closes them, "fill" trusts the tensors there."""
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        super().__post_init__()
         if self.switch_cost > 0 and self.tensors is None:
             raise ConfigError("switch_cost > 0 needs the F_i of all policies: tensors=[F_1, ...]")
         lists = {"tensors": self.tensors, "ood": self.ood, "names": self.names}
         given = {what: len(one) for what, one in lists.items() if one is not None}
-        # What is given is stacked, and the layers that are searched are made of it.
-        arrays = 4 + 2 * given.get("tensors", 0) + given.get("ood", 0)
-        each = self.grid.heights.size * directions.NUM_HEADINGS * 8
-        require_memory(arrays * each, f"planning over {_size(self.grid)}", CURE)
+        self.check_memory(self.grid, given.get("tensors", 0) + given.get("ood", 0))
         self._fused = self._fit("fused", [self.fused])[0]
         policy_map = self._fit("policy_map", [self.policy_map])[0]
         self._policy_map = policy_map.astype(np.int64, copy=False)
@@ -190,6 +208,13 @@ class Planner:
         for heading, tail, head in steps_of(self.grid.shape):
             allowed[(*tail, heading)] = usable[tail] & usable[head]
         return np.where(allowed & (layers >= np.float64(self.f_min)), layers, layers.dtype.type(0))
+
+    def search(self, start: Point, goal: Point) -> Route:
+        """Return the cheapest route, with the library that `backend` names; raises as `plan`."""
+        if self.backend == "networkx":
+            return self.search_networkx(start, goal)
+        self.cell_of(start, "start")  # an unusable start need not wait for the search
+        return self.towards(goal).route(start)
 
     def towards(self, goal: Point) -> Tree:
         """Search backwards from the goal to every cell, with scipy."""

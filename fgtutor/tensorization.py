@@ -16,9 +16,10 @@ once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import torch
@@ -29,12 +30,16 @@ from fgtutor import directions, patches
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, ThresholdError
 from fgtutor.feasibility import TAU_HIGH, TAU_LOW, calibrated_taus, ood_weight
+from fgtutor.grid import point_text
+from fgtutor.machine import require_memory
+from fgtutor.progress import watch
 
 if TYPE_CHECKING:
     from fgtutor.specialist import Specialist
 
 Taus = Literal["paper", "calibrated"] | tuple[float, float]
 Method = Literal["auto", "reference", "fast"]
+Unknown = Literal["block", "fill"]
 
 STRIP_CELLS = 2048
 """Cells assessed at a time: 187 points of each are 1.5 MB. The speed hardly depends on it."""
@@ -64,17 +69,21 @@ def tensorize(
     *,
     taus: Taus = "paper",
     method: Method = "auto",
-    unknown: Literal["block", "fill"] = "block",
+    unknown: Unknown = "block",
+    progress: bool = False,
 ) -> Float[Tensor, "nx ny 8"]:
     """Return F_i(x, y, k) = w_ood * f: how well this specialist leaves a cell along heading k.
 
     `taus` is "paper", "calibrated" (from the specialist's own terrain) or a pair (low, high). With
     `unknown="block"` F is zero wherever a step would start from or end on an unknown cell, or leave
-    the map; "fill" trusts the filled heights instead. Raises `ThresholdError` or `ConfigError` for
-    settings that cannot work.
+    the map; "fill" trusts the filled heights instead. `progress` shows a bar if it takes long.
+
+    Raises:
+        ThresholdError, ConfigError: A setting has a value without meaning.
+        TooLargeError: The tensors do not fit into memory.
     """
-    team = {"": specialist}
-    return tensorize_all(elevation, team, taus=taus, method=method, unknown=unknown)[""]
+    settings: dict = {"taus": taus, "method": method, "unknown": unknown, "progress": progress}
+    return tensorize_all(elevation, {"": specialist}, **settings)[""]
 
 
 def tensorize_all(
@@ -83,14 +92,16 @@ def tensorize_all(
     *,
     taus: Taus = "paper",
     method: Method = "auto",
-    unknown: Literal["block", "fill"] = "block",
+    unknown: Unknown = "block",
+    progress: bool = False,
 ) -> dict[str, Float[Tensor, "nx ny 8"]]:
     """Return F_i of each policy of `zoo`: what `tensorize` gives, in less time (`assess_all`)."""
-    if unknown not in ("block", "fill"):
-        raise ConfigError(f'unknown must be "block" or "fill", got {unknown!r}')
+    if unknown not in get_args(Unknown):
+        raise ConfigError(f"unknown must be one of {', '.join(get_args(Unknown))}, got {unknown!r}")
     thresholds = {name: resolve_taus(taus, specialist) for name, specialist in zoo.items()}
-    said = assess_all(elevation, zoo, method)
-    tensors = {name: one.weighted(*thresholds[name]) for name, one in said.items()}
+    said = assess_all(elevation, zoo, method, progress=progress)
+    # One policy after the other, so that only one tensor more than they say is ever kept.
+    tensors = {name: said.pop(name).weighted(*thresholds[name]) for name in zoo}
     if unknown == "block":
         closed = ~torch.from_numpy(steps_on_known(elevation.known))
         for tensor in tensors.values():
@@ -109,42 +120,67 @@ def assess(elevation: ElevationMap, specialist: Specialist, method: Method = "au
 
 @torch.no_grad()
 def assess_all(
-    elevation: ElevationMap, zoo: Mapping[str, Specialist], method: Method = "auto"
+    elevation: ElevationMap,
+    zoo: Mapping[str, Specialist],
+    method: Method = "auto",
+    *,
+    progress: bool = False,
 ) -> dict[str, Assessment]:
     """Return what each policy of `zoo` says; those with the same patch grid share its patches.
 
-    Raises what `assess` raises.
+    `progress` shows a bar if it takes long. Raises what `assess` raises.
     """
     if method not in _WAYS:
         raise ConfigError(f"method must be one of {', '.join(_WAYS)}, got {method!r}")
+    nx, ny = elevation.shape
+    work = f"assessing {nx} x {ny} cells for {len(zoo)} polic{'y' if len(zoo) == 1 else 'ies'}"
+    # f and L_recon in 4 bytes each, and one F_i.
+    needed = 4.0 * nx * ny * directions.NUM_HEADINGS * (2 * len(zoo) + 1)
+    require_memory(needed, work, "take a part of the map (ElevationMap.crop) or coarser cells")
     heights = patches.prepare(elevation).heights
-    nx, ny = heights.shape
     blank = torch.empty(2, nx, ny, directions.NUM_HEADINGS)
     said = {name: Assessment(*blank.clone()) for name in zoo}
-    for grid in {specialist.grid for specialist in zoo.values()}:
-        team = {name: one for name, one in zoo.items() if one.grid == grid}
-        for heading, yaw in enumerate(directions.YAWS):
-            for rows, patch in _WAYS[method](heights, yaw, grid, elevation.resolution):
-                distinct, cells = _distinct(patch)
-                for name, specialist in team.items():
-                    net, one = specialist.feasibility, said[name]
-                    command = torch.tensor(specialist.command, dtype=torch.float32)
-                    f = net.feasibility(distinct, command.expand(len(distinct), -1))
-                    one.f[rows, :, heading] = f[cells].reshape(-1, ny)
-                    loss = net.reconstruction(distinct)
-                    one.reconstruction[rows, :, heading] = loss[cells].reshape(-1, ny)
+    grids = {specialist.grid for specialist in zoo.values()}
+    tiles = (
+        (grid, heading, rows, patch)
+        for grid in grids
+        for heading, yaw in enumerate(directions.YAWS)
+        for rows, patch in _WAYS[method](heights, yaw, grid, elevation.resolution)
+    )
+    total = len(grids) * directions.NUM_HEADINGS * len(list(_strips(heights.shape)))
+    for grid, heading, rows, patch in watch(tiles, total, work, show=progress, unit="tile"):
+        distinct, cells = _distinct(patch)
+        for name, specialist in zoo.items():
+            if specialist.grid != grid:
+                continue
+            net, one = specialist.feasibility, said[name]
+            command = torch.tensor(specialist.command, dtype=torch.float32)
+            f = net.feasibility(distinct, command.expand(len(distinct), -1))
+            one.f[rows, :, heading] = f[cells].reshape(-1, ny)
+            loss = net.reconstruction(distinct)
+            one.reconstruction[rows, :, heading] = loss[cells].reshape(-1, ny)
     return said
 
 
 def resolve_taus(taus: Taus, specialist: Specialist) -> tuple[float, float]:
-    """Return (tau_low, tau_high) for a choice by name, or the given pair."""
+    """Return (tau_low, tau_high) for a choice by name, or the given pair.
+
+    Raises `ThresholdError` for another name, and unless 0 <= tau_low < tau_high, both finite.
+    """
     if taus == "paper":
         return TAU_LOW, TAU_HIGH
     if taus == "calibrated":
         return calibrated_taus(specialist.quantiles)
-    if isinstance(taus, str) or len(taus) != 2:
-        raise ThresholdError(f'taus must be "paper", "calibrated" or (low, high), got {taus!r}')
-    return taus
+    try:
+        low, high = (float(tau) for tau in taus)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if isinstance(taus, str) or not 0 <= low < high < math.inf:
+        raise ThresholdError(
+            'taus must be "paper", "calibrated" or finite numbers 0 <= tau_low < tau_high, got '
+            f"{taus!r}"
+        )
+    return low, high
 
 
 def why_blocked(
@@ -161,10 +197,11 @@ def why_blocked(
     `assessments` holds each policy's `assess` of the map and `taus` each one's thresholds (default:
     the paper's). A cell is closed when no policy can leave it with F >= f_min.
     """
+    place = f"{point_text((x, y), elevation.resolution)} m"
     if not elevation.contains(x, y):
-        return f"({x:g}, {y:g}) m is off the map."
+        return f"{place} is off the map."
     cell = elevation.cell_of(x, y)
-    where = f"Cell {cell} at ({x:g}, {y:g}) m"
+    where = f"Cell {cell} at {place}"
     if not elevation.known[cell]:
         return f"{where} is closed: it was never observed."
     open_headings = np.flatnonzero(steps_on_known(elevation.known)[cell])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from fgtutor import patches, pipeline, progress
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import (
     ConfigError,
@@ -12,6 +13,7 @@ from fgtutor.errors import (
     MapError,
     OffMapError,
     StorageError,
+    ThresholdError,
     UnknownCellError,
 )
 from fgtutor.pipeline import PlanConfig, choose, plan_on_map, run
@@ -71,11 +73,49 @@ def test_tensors_already_computed_are_used(case, make_rolling):
         ({"goal": (1.55, 1.05)}, UnknownCellError, "goal"),
         ({"f_min": 0.95}, InfeasibleCellError, "f_min"),
         ({"policies": ("wings",)}, ConfigError, "wings"),
+        ({"policies": ("sure", "sure")}, ConfigError, "policies: .*only once"),
+        ({"start": (math.nan, 1.0)}, ConfigError, "start.*finite"),
+        ({"goal": (1.0, math.inf)}, ConfigError, "goal.*finite"),
+        ({"f_min": math.nan}, ConfigError, "f_min"),
+        ({"f_min": 0.0}, ConfigError, "f_min"),
+        ({"switch_cost": -1.0}, ConfigError, "switch_cost"),
+        ({"switch_cost": math.inf}, ConfigError, "switch_cost"),
     ],
 )
 def test_bad_requests_say_which_and_what_to_do(case, change, error, message):
     with pytest.raises(error, match=message):
         run(PlanConfig(**case | change))
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"start": (9.0, 1.0)}, OffMapError),
+        ({"goal": (1.55, 1.05)}, UnknownCellError),
+        ({"goal": "there"}, ConfigError),
+        ({"f_min": -1.0}, ConfigError),
+        ({"backend": "astar"}, ConfigError),
+        ({"taus": (2.0, 1.0)}, ThresholdError),
+    ],
+)
+def test_what_cannot_work_is_refused_before_the_map_is_tensorized(
+    case, make_rolling, monkeypatch, change, error
+):
+    monkeypatch.setattr(patches, "prepare", None)  # the first thing that tensorizing calls
+    arguments = {"start": case["start"], "goal": case["goal"]} | change
+    with pytest.raises(error):
+        plan_on_map(ElevationMap.load(case["map"]), {"a": make_rolling("a")}, **arguments)
+
+
+def test_a_long_plan_says_how_long(case, monkeypatch, capsys):
+    for name in ("QUICK", "TRIED", "LONG"):
+        monkeypatch.setattr(progress, name, 0.0)
+    monkeypatch.setattr(pipeline, "QUICK", 0.0)
+    assert run(PlanConfig(**case)) == 0
+    shown = capsys.readouterr()
+    assert "assessing 30 x 20 cells for 2 policies: about" in shown.err
+    assert "searching the route: about 0 s" in shown.err
+    assert shown.out.startswith("Route(") and "\n" not in shown.out.strip()
 
 
 def test_a_missing_map_and_a_folder_that_is_none(case, tmp_path):

@@ -377,7 +377,7 @@ def test_unknown_cells_are_never_silently_free(backend):
         ({"f_min": np.inf}, ConfigError, "f_min: should be a finite number"),
         ({"f_min": "0.1"}, ConfigError, "f_min: should be a valid number"),
         ({"cost": "time"}, ConfigError, "'inverse' or 'length'"),
-        ({"backend": "astar"}, ConfigError, "auto, networkx, scipy"),
+        ({"backend": "astar"}, ConfigError, "'auto', 'networkx' or 'scipy'"),
         ({"unknown": "free"}, ConfigError, "'block' or 'fill'"),
         ({"switch_cost": -1.0}, ConfigError, "switch_cost: should be greater than or equal to 0"),
         ({"switch_cost": np.nan}, ConfigError, "switch_cost: should be a finite number"),

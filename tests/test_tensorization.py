@@ -1,14 +1,16 @@
 """Tensorization: the fast way against the reference, symmetry, unknown cells, reasons."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fgtutor import directions, patches, tensorization
+from fgtutor import directions, machine, patches, progress, tensorization
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError, ThresholdError
+from fgtutor.errors import ConfigError, ThresholdError, TooLargeError
 from fgtutor.patches import PatchGrid
 from fgtutor.tensorization import (
     assess,
@@ -212,9 +214,10 @@ def test_taus_by_name_and_by_number(make_specialist):
 
 def test_settings_that_cannot_work_are_refused(make_specialist):
     specialist, elevation = make_specialist(), rough(4, 4)
-    with pytest.raises(ThresholdError, match="tau_low < tau_high"):
+    with pytest.raises(ThresholdError, match="0 <= tau_low < tau_high"):
         tensorize(elevation, specialist, taus=(2.0, 0.1))
-    for taus in ("loose", (1.0, 2.0, 3.0)):
+    unusable = ["loose", "12", (1.0, 2.0, 3.0), (1.0, 1.0), (-1.0, 1.0), (0.1, np.inf), None, 0.1]
+    for taus in [*unusable, (np.nan, 1.0), (0.1, np.nan), ("low", "high")]:
         with pytest.raises(ThresholdError, match="taus must be"):
             tensorize(elevation, specialist, taus=taus)
     with pytest.raises(ConfigError, match="reference, fast"):
@@ -272,6 +275,49 @@ def test_why_blocked_names_the_layer(make_specialist):
     assert "is open: steps leaves it towards" in why(0.65, 0.65)
     assert "would not keep its velocity" in why(0.65, 0.65, f_min=0.99)
     assert "does not know such terrain" in why(0.65, 0.65, tau_low=1e-9)
+
+
+@pytest.mark.parametrize("origin", [(500000, 4649776), (500000.35, 5648298.15)])
+def test_why_blocked_shows_places_to_the_cell_far_from_the_origin(make_specialist, origin):
+    elevation = ElevationMap(with_hole().heights, origin=origin)
+    assessments = {"steps": assess(elevation, make_specialist("steps"))}
+    for dx, dy in ((0.45, 0.35), (0.65, 0.65), (-0.05, 0.35)):
+        x, y = origin[0] + dx, origin[1] + dy
+        reason = why_blocked(x, y, elevation=elevation, assessments=assessments)
+        assert f"({x:.2f}, {y:.2f}) m" in reason
+
+
+def test_a_map_too_large_for_the_memory_left_is_refused(make_specialist, monkeypatch):
+    monkeypatch.setattr(machine, "ALWAYS_LEFT", 0)
+    monkeypatch.setattr(machine, "available_memory", lambda: 19_000)
+    with pytest.raises(TooLargeError, match=r"10 x 20 cells for 1 policy needs about 1.92e-05 GB"):
+        tensorize(rough(10, 20), make_specialist())
+
+
+def test_a_bar_and_the_expected_time_are_shown_where_asked(make_specialist, monkeypatch, capsys):
+    team = {"a": make_specialist("a"), "b": make_specialist("b", grid=ASYMMETRIC)}
+    monkeypatch.setattr(tensorization, "STRIP_CELLS", 50)
+    for name in ("QUICK", "TRIED", "LONG"):
+        monkeypatch.setattr(progress, name, 0.0)
+    tensorize_all(rough(15, 20), team)
+    assert not capsys.readouterr().err
+    tensorize_all(rough(15, 20), team, progress=True)
+    shown = capsys.readouterr().err
+    assert re.search("assessing 15 x 20 cells for 2 policies: about [0-9]+ s\n", shown)
+    # Two rows a strip are 8 strips; with 8 headings and two grids 128 tiles.
+    assert "128/128" in shown
+
+
+def test_what_is_quick_shows_nothing(make_specialist, capsys):
+    tensorize(rough(5, 5), make_specialist(), progress=True)
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(12.4, "12 s"), (89, "89 s"), (600, "10 min"), (9000, "2.5 h")]
+)
+def test_an_expected_time_is_round(seconds, words):
+    assert progress.duration(seconds) == words
 
 
 def test_why_blocked_sees_a_cell_walled_in_by_unknown_ones(make_specialist):
