@@ -242,7 +242,7 @@ def test_two_evaluations_in_one_folder_are_one_run(victim, other, zoo, tmp_path)
     while not (tmp_path / "both" / LOCK).exists():
         time.sleep(0.001)
     code, said = other.run([*words, tmp_path / "both"])
-    assert code == 2 and "another process works in" in said, said
+    assert code == 2 and "another process" in said, said
     assert victim.end() == 0
     assert report(tmp_path / "both") == report(tmp_path / "whole")
 
@@ -254,6 +254,6 @@ def test_two_trainings_in_one_folder_are_one_run(victim, other, tmp_path):
     while not (tmp_path / "both" / LOCK).exists():
         time.sleep(0.001)
     code, said = other.run([*words, tmp_path / "both", "--seed", "2"])
-    assert code == 2 and "another process works in" in said, said
+    assert code == 2 and "another process" in said, said
     assert victim.end() == 0
     assert weights(tmp_path / "both" / "specialist") == weights(tmp_path / "whole" / "specialist")
