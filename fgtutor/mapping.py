@@ -11,7 +11,8 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from fgtutor.cloudfiles import read_points
+from fgtutor.cloudfiles import read_cloud
+from fgtutor.clouds import note
 from fgtutor.scanning import Area, ScanConfig, map_points
 from fgtutor.storage import check_writable
 
@@ -37,9 +38,9 @@ def run(config: MapConfig) -> int:
     for path in (config.out, config.statistics):
         if path is not None:
             check_writable(path)
-    points = read_points(config.cloud)
-    print(f"{config.cloud}: {len(points)} points")
-    scanned = map_points(points, config=config, area=config.area)
+    cloud = read_cloud(config.cloud)
+    print(f"{config.cloud}: {len(cloud.points)} points")
+    scanned = map_points(cloud, config=config, area=config.area)
     print(scanned)
     elevation = scanned.elevation
     unknown = 1 - elevation.known.mean()
@@ -50,4 +51,14 @@ def run(config: MapConfig) -> int:
         print(f"statistics -> {config.statistics}")
     (elevation.filled() if config.fill else elevation).save(config.out)
     print(f"map -> {config.out}")
+    left_out = (
+        *cloud.notes,
+        *note(scanned.outside, "point", " outside the area"),
+        *note(scanned.outliers, "outlier", " far from the others"),
+        *note(
+            scanned.overhanging, "point", f" hanging {config.clearance:g} m above others or more"
+        ),
+        *note(scanned.sparse, "point", f" in cells with fewer than {config.min_points}"),
+    )
+    print(f"left out or converted: {'; '.join(left_out) or 'nothing'}")
     return 0

@@ -9,23 +9,34 @@ Rusu et al., "Towards 3D Point Cloud Based Object Maps for Household Environment
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
-from fgtutor.cloudfiles import Points, finite
+from fgtutor.clouds import Cloud, Points, cloud_of
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import CloudError, ConfigError
+from fgtutor.errors import CloudError
+from fgtutor.grid import MOST_CELLS, cells_of, check_cells, coordinate_text
 from fgtutor.storage import atomic_write
+from fgtutor.validation import (
+    Count,
+    NonNegative,
+    Unbounded,
+    check_arguments,
+    check_fields,
+)
 
 Area = tuple[float, float, float, float]
 
 VOXEL = 0.05
 """Side of a voxel, m (paper); a cell is divided into whole voxels as near to it as possible."""
-MOST_CELLS = 50_000_000
-"""Larger maps are refused, since they almost always come from a wrong unit: 350 m x 350 m."""
+_EMPTY = 1000
+"""A map of more than a million cells is refused if it has more cells a point than this, for the
+same reason that `MOST_CELLS` is."""
 WALL = 0.2
 """Points of a cell that are spread over more than this lie on a wall too, m. No step is so high,
 and no slope that can be walked rises so far within a cell."""
@@ -34,7 +45,8 @@ LAYER = 0.08
 of a MID-360's range."""
 AROUND = 0.15
 """How far level ground is looked for, m, which tells how many points such a layer holds here."""
-_TICK = 1e-4
+_DISTANCES = 10**7
+"""Distances that are kept in memory at a time."""
 _TICK = 1e-4
 """Heights are sorted in steps of this, m; far below what any scanner resolves."""
 
@@ -43,32 +55,22 @@ _TICK = 1e-4
 class ScanConfig:
     """How a point cloud becomes a map."""
 
-    resolution: float = 0.05
+    resolution: Annotated[float, Interval(gt=0, le=1000)] = 0.05
     """Side of a cell, m."""
-    neighbours: int = 8
+    neighbours: Annotated[int, Interval(ge=0, le=1000)] = 8
     """Voxels that the outlier test looks at around each voxel; 0 leaves the test out."""
-    outlier_ratio: float = 3.0
+    outlier_ratio: NonNegative = 3.0
     """A voxel is an outlier if its mean distance to its neighbours exceeds the cloud's mean by this
-    many standard deviations, and two and a half voxels in any case."""
-    min_points: int = 2
+    many standard deviations, and in any case two and a half voxels, and twice what the nearest
+    neighbour is usually away."""
+    min_points: Count = 2
     """A cell with fewer points stays unknown."""
-    clearance: float = 1.5
+    clearance: Unbounded = 1.5
     """Points that hang at least this far above those below them are no ground (a ceiling, leaves)
     and are left out, m."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.resolution) and self.resolution > 0):
-            raise ConfigError(f"resolution must be a positive number of m, got {self.resolution}")
-        if self.neighbours < 0 or self.min_points < 1:
-            raise ConfigError(
-                "need neighbours >= 0 and min_points >= 1, got "
-                f"{self.neighbours} and {self.min_points}"
-            )
-        if not (self.outlier_ratio >= 0 and self.clearance > 0):
-            raise ConfigError(
-                "need outlier_ratio >= 0 and clearance > 0 m, got "
-                f"{self.outlier_ratio} and {self.clearance}"
-            )
+        check_fields(self)
 
     @property
     def voxel(self) -> float:
@@ -97,6 +99,13 @@ class ScannedMap:
     """Points that the outlier test removed."""
     overhanging: int
     """Points that hung too far above the ground."""
+    outside: int = 0
+    """Points outside the area."""
+
+    @property
+    def sparse(self) -> int:
+        """Points in cells that have too few of them."""
+        return int(self.count[~self.elevation.known].sum())
 
     def __repr__(self) -> str:
         return (
@@ -118,52 +127,58 @@ class ScannedMap:
 
 
 def map_points(
-    points: Points, *, config: ScanConfig | None = None, area: Area | None = None
+    points: Points | Cloud, *, config: ScanConfig | None = None, area: Area | None = None
 ) -> ScannedMap:
     """Turn a cloud into a map.
 
     Args:
-        points: Points in metres, z up; rows that are not finite are left out.
+        points: Points in metres, z up; rows that are masked or not finite are left out.
         config: The settings.
-        area: Corners (x0, y0, x1, y1) that the map covers, m; its cells begin at (x0, y0).
-            Default: all points, with cell borders at multiples of the resolution.
+        area: Corners (x0, y0, x1, y1) that the map covers, m; its cells begin at (x0, y0), and a
+            cell that reaches beyond (x1, y1) belongs to it. Default: all points, with cell borders
+            at multiples of the resolution.
 
     Raises:
-        CloudError: There are no points, none lies in the area, no cell has enough of them, or the
-            map would be absurdly large.
+        CloudError: There are no points, none lies in the area, no cell has enough of them, they
+            are stored too coarsely for the cells, or the map would be absurdly large.
     """
     config = config or ScanConfig()
-    points = finite(points)
-    corner = np.zeros(2)
+    check_arguments(map_points, {"area": area}, CloudError)
+    cloud = cloud_of(points)
+    _check_step(cloud, config.resolution)
+    points, corner, shape = cloud.points, np.zeros(2), None
+    # In their own type, whose rounding tells how near to a border a point lies on it.
+    stored = points.astype(np.float32) if cloud.single else points
     if area is not None:
-        corner = np.array(area[:2], dtype=float)
-        if not (area[0] < area[2] and area[1] < area[3]):
+        corner, end = np.array(area[:2], dtype=float), np.array(area[2:], dtype=float)
+        if not (corner < end).all():
             raise CloudError(f"the area {area} is empty: give x0 y0 x1 y1 with x0 < x1 and y0 < y1")
-        inside = ((points[:, :2] >= corner) & (points[:, :2] < area[2:])).all(axis=1)
+        shape = np.maximum(-cells_of(-end, -corner, config.resolution), 2)
+        check_cells(shape.tolist(), CloudError)
+    cells = cells_of(stored[:, :2], corner, config.resolution)
+    if shape is not None:
+        inside = ((cells >= 0) & (cells < shape)).all(axis=1)
         if not inside.any():
             raise CloudError(
-                f"no point lies in the area {area}; the cloud covers {_extent(points)}"
+                f"no point lies in the area {area}; the cloud covers {_extent(points, config)}"
             )
-        points = points[inside]
-    keep = _inliers(points, corner, config)
+        points, stored, cells = points[inside], stored[inside], cells[inside]
+    outside = len(cloud.points) - len(points)
+    keep = _inliers(points, stored, corner, config)
     outliers = len(points) - int(keep.sum())
-    points = points[keep] if outliers else points
-
-    cells = np.floor((points[:, :2] - corner) / config.resolution).astype(np.int64)
-    if area is None:
+    if outliers:
+        points, cells = points[keep], cells[keep]
+    first = np.zeros(2, dtype=np.int64)
+    if shape is None:
         first = cells.min(axis=0)
-        shape = cells.max(axis=0) - first + 1
-    else:
-        first = np.zeros(2, dtype=np.int64)
-        # A share of a cell counts as one, but not the error of dividing decimals.
-        shape = np.ceil((np.array(area[2:]) - corner) / config.resolution - 1e-6).astype(np.int64)
-    shape = np.maximum(shape, 2)
-    if shape.prod() > MOST_CELLS:
-        raise CloudError(
-            f"a map of {shape[0]} x {shape[1]} cells is too large for the cloud over "
-            f"{_extent(points)}: check that it is in metres, give an area, or a coarser resolution"
-        )
-    cells = np.clip(cells - first, 0, shape - 1)
+        shape = np.maximum(cells.max(axis=0) - first + 1, 2)
+        if math.prod(shape.tolist()) > min(MOST_CELLS, max(10**6, _EMPTY * len(points))):
+            raise CloudError(
+                f"a map of {shape[0]} x {shape[1]} cells is too large for the cloud over "
+                f"{_extent(points, config)}: check that it is in metres, give an area, or a "
+                "coarser resolution"
+            )
+    cells -= first
     origin = np.round(corner + first * config.resolution, 9).tolist()
     return _statistics(
         cells[:, 0] * shape[1] + cells[:, 1],
@@ -171,36 +186,62 @@ def map_points(
         (int(shape[0]), int(shape[1])),
         (origin[0], origin[1]),
         config,
-        outliers,
+        {"outliers": outliers, "outside": outside},
     )
 
 
-def _inliers(points: Points, corner: np.ndarray, config: ScanConfig) -> Bool[np.ndarray, " n"]:
+def _check_step(cloud: Cloud, resolution: float) -> None:
+    """Raise `CloudError` if neighbouring values of a coordinate are too far apart for the cells.
+
+    Floats come in steps of powers of two, which fit no cell: with a tenth of it, cells get up to a
+    tenth more points than others. The steps of LAS are decimal, as cells are, and mostly divide
+    them; with half a cell some still get twice what others get, beyond that some get none.
+    """
+    largest = float(np.abs(cloud.points).max())
+    floats = cloud.single or cloud.step <= np.spacing(largest)
+    if cloud.step > resolution / (10 if floats else 2):
+        cure = "subtract an offset from them" + ", or export doubles" * cloud.single
+        raise CloudError(
+            f"the coordinates, up to {largest:g} m, are stored in steps of {cloud.step:g} m, too "
+            f"coarse for cells of {resolution:g} m: "
+            + (cure if floats else "export with a finer scale, or choose coarser cells")
+        )
+
+
+def _inliers(
+    points: Points, stored: np.ndarray, corner: np.ndarray, config: ScanConfig
+) -> Bool[np.ndarray, " n"]:
     """Tell which points lie in voxels that have neighbours as near as voxels usually have.
 
     Voxels, not points, are compared: near the scanner points lie closer, voxels do not; and a
     hundred times fewer of them have to be searched.
     """
-    voxels = np.floor((points - (*corner, 0.0)) / config.voxel)
+    voxels = cells_of(stored, (*corner, 0.0), config.voxel)
     voxels -= voxels.min(axis=0)
-    shape = voxels.max(axis=0) + 1
-    if np.log2(shape).sum() >= 62:
+    nx, ny, nz = (voxels.max(axis=0) + 1).tolist()
+    if nx * ny * nz >= 2**62:
         raise CloudError(
-            f"the cloud covers {_extent(points)}, too far for voxels of {config.voxel:g} m: check "
-            "that it is in metres, or give an area"
+            f"the cloud covers {_extent(points, config)}, too far for voxels of {config.voxel:g} m:"
+            " check that it is in metres, or give an area"
         )
-    _, ny, nz = shape.astype(np.int64).tolist()
-    ix, iy, iz = voxels.astype(np.int64).T
+    ix, iy, iz = voxels.T
     _, voxel, count = np.unique((ix * ny + iy) * nz + iz, return_inverse=True, return_counts=True)
     if config.neighbours == 0 or len(count) <= config.neighbours:
         return np.ones(len(points), dtype=bool)
     centres = np.stack([np.bincount(voxel, axis) / count for axis in points.T], axis=-1)
-    distance, _ = cKDTree(centres).query(centres, config.neighbours + 1, workers=-1)
-    # Each voxel is its own nearest neighbour, at distance 0.
-    distance = distance.sum(axis=1) / config.neighbours
-    limit = distance.mean() + config.outlier_ratio * distance.std()
-    # In a corner of an even sheet the mean distance is 1.8 voxels, and being there is no fault.
-    return (distance <= max(limit, 2.5 * config.voxel))[voxel]
+    tree, parts = cKDTree(centres), -(-len(centres) * (config.neighbours + 1) // _DISTANCES)
+    means, nearest = [], []
+    for part in np.array_split(centres, parts):
+        # Each voxel is its own nearest neighbour, at distance 0.
+        distance = tree.query(part, config.neighbours + 1, workers=-1)[0]
+        means.append(distance.sum(axis=1) / config.neighbours)
+        nearest.append(distance[:, 1])
+    mean = np.concatenate(means)
+    limit = mean.mean() + config.outlier_ratio * mean.std()
+    # In a corner of an even sheet the mean distance is 1.8 times that to the nearest, and being
+    # there is no fault.
+    least = max(2.5 * config.voxel, 2.0 * float(np.median(np.concatenate(nearest))))
+    return (mean <= max(limit, least))[voxel]
 
 
 def _statistics(
@@ -209,15 +250,15 @@ def _statistics(
     shape: tuple[int, int],
     origin: tuple[float, float],
     config: ScanConfig,
-    outliers: int,
+    left_out: dict[str, int],
 ) -> ScannedMap:
     """Sort the points by cell and height, and read every statistic off the sorted heights."""
     # One sort of whole numbers, cell and height in one, is ten times faster than two of floats.
     low = z.min()
-    ticks = np.round((z - low) / _TICK).astype(np.int64)
-    span = int(ticks.max()) + 1
+    span = int((z.max() - low) / _TICK) + 2
     if span * shape[0] * shape[1] >= 2**63:
         raise CloudError(f"heights reach from {low:g} to {z.max():g} m: check that z is in metres")
+    ticks = np.round((z - low) / _TICK).astype(np.int64)
     cell, ticks = np.divmod(np.sort(cell * span + ticks), span)
     z = low + ticks * _TICK
 
@@ -253,7 +294,7 @@ def _statistics(
     lowest, p95 = z[first], quantile(0.95)
     walled = p95 - lowest > WALL
     on_top = total((z > np.repeat(p95 - LAYER, count)).astype(np.int64))
-    around = 2 * round(AROUND / config.resolution) + 1
+    around = 2 * min(round(AROUND / config.resolution), max(shape)) + 1
     level = ndimage.maximum_filter(grid(np.where(walled, 0, count), empty=0.0), size=around)
     # What a wall holds up shows as many points on top as level ground. What lies at its foot shows
     # there only those of the wall that fall into its cell: fewer, or a small share of its own.
@@ -267,7 +308,7 @@ def _statistics(
             f"no cell of {config.resolution:g} m holds {config.min_points} points: scan more "
             "densely, choose a coarser resolution or a lower min_points"
         )
-    counts = np.zeros(shape, dtype=np.int64)
+    counts = np.zeros(shape, dtype=np.int32)
     counts[where] = count
     return ScannedMap(
         elevation=ElevationMap(
@@ -279,12 +320,15 @@ def _statistics(
         lowest=grid(lowest),
         p95=grid(p95),
         variance=grid(variance),
-        outliers=outliers,
         overhanging=overhanging,
+        **left_out,
     )
 
 
-def _extent(points: Points) -> str:
+def _extent(points: Points, config: ScanConfig) -> str:
     """Return what a cloud covers, in words."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    return ", ".join(f"{axis} {a:g}..{b:g} m" for axis, a, b in zip("xyz", low, high, strict=True))
+    low, high = (
+        [coordinate_text(value, config.resolution) for value in corner]
+        for corner in (points.min(axis=0).tolist(), points.max(axis=0).tolist())
+    )
+    return ", ".join(f"{axis} {a}..{b} m" for axis, a, b in zip("xyz", low, high, strict=True))

@@ -1,208 +1,17 @@
-"""Point clouds: files of every kind, outliers, cells and their statistics, and `fgtutor map`."""
+"""From points to maps: outliers, cells and their statistics."""
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 
-import laspy
 import numpy as np
 import pytest
-import trimesh
-import tyro
-from hypothesis import given, settings
+from cloud_writers import cloud, sheet
+from hypothesis import given
 from hypothesis import strategies as st
-from pypcd4 import Encoding, PointCloud
 
-from fgtutor import mapping
-from fgtutor.cloudfiles import read_points, save_points
-from fgtutor.elevation import ElevationMap
-from fgtutor.errors import CloudError, ConfigError, MapError, StorageError
+from fgtutor import scanning
+from fgtutor.errors import CloudError, ConfigError
+from fgtutor.grid import MOST_CELLS
 from fgtutor.scanning import WALL, ScanConfig, map_points
-
-
-def cloud(n: int = 200, seed: int = 0) -> np.ndarray:
-    """Return random points to the millimetre, which every file format keeps."""
-    return np.random.default_rng(seed).uniform((-1, 2, -0.5), (3, 5, 0.5), (n, 3)).round(3)
-
-
-def sheet(nx: int = 20, ny: int = 12, *, per_cell: int = 4, seed: int = 0) -> np.ndarray:
-    """Return an even sheet of points in cells of 5 cm from (0, 0), with asymmetric relief."""
-    rng = np.random.default_rng(seed)
-    cell = np.indices((nx, ny)).reshape(2, -1).T.repeat(per_cell, axis=0)
-    xy = 0.05 * (cell + rng.uniform(0.1, 0.9, cell.shape))
-    z = 0.3 * np.sin(3 * xy[:, 0]) + 0.1 * xy[:, 1] + rng.normal(0, 0.005, len(xy))
-    return np.column_stack((xy, z))
-
-
-# -- files -----------------------------------------------------------------------------------------
-
-
-def write_ply(path: Path, points: np.ndarray) -> None:
-    path.write_bytes(trimesh.PointCloud(points).export(file_type="ply"))  # pyright: ignore
-
-
-def write_ascii_ply(path: Path, points: np.ndarray) -> None:
-    rows = "\n".join(f"7 {x} {y} {z}" for x, y, z in points)
-    path.write_text(
-        f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty uchar intensity\n"
-        f"property double x\nproperty double y\nproperty double z\nend_header\n{rows}\n"
-    )
-
-
-def write_pcd(encoding: Encoding) -> Callable[[Path, np.ndarray], None]:
-    return lambda path, points: PointCloud.from_xyz_points(points).save(path, encoding)
-
-
-def write_las(path: Path, points: np.ndarray) -> None:
-    header = laspy.LasHeader(point_format=3, version="1.4")
-    header.scales, header.offsets = np.full(3, 0.001), points.min(axis=0)
-    las = laspy.LasData(header)
-    las.xyz = points
-    las.write(path)
-
-
-def write_xyz(start: str, separator: str) -> Callable[[Path, np.ndarray], None]:
-    def write(path: Path, points: np.ndarray) -> None:
-        rows = (separator.join((*map(str, row), "255")) for row in points)
-        path.write_text(start + "\n".join(rows) + "\n")
-
-    return write
-
-
-FORMATS = {
-    "binary ply": ("cloud.ply", write_ply),
-    "ascii ply": ("cloud.PLY", write_ascii_ply),
-    "ascii pcd": ("cloud.pcd", write_pcd(Encoding.ASCII)),
-    "binary pcd": ("cloud.pcd", write_pcd(Encoding.BINARY)),
-    "compressed pcd": ("cloud.pcd", write_pcd(Encoding.BINARY_COMPRESSED)),
-    "las": ("cloud.las", write_las),
-    "laz": ("cloud.laz", write_las),
-    "xyz": ("cloud.xyz", write_xyz("", " ")),
-    "xyz with names": ("cloud.xyz", write_xyz("# by hand\n\nX;Y;Z;I\n", ";")),
-    "xyz with commas": ("cloud.xyz", write_xyz("//X,Y,Z,I\n", ", ")),
-    "npz": ("cloud.npz", lambda path, points: save_points(points, path)),
-}
-COUNTED = [name for name in FORMATS if "xyz" not in name]
-"""The formats that say how many points they hold, or notice a missing end."""
-
-
-def written(folder: Path, name: str, points: np.ndarray | None = None) -> Path:
-    file, write = FORMATS[name]
-    write(folder / file, cloud() if points is None else points)
-    return folder / file
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_every_format_gives_the_points_back(tmp_path: Path, name: str) -> None:
-    points = read_points(written(tmp_path, name))
-    assert points.dtype == np.float64
-    np.testing.assert_allclose(points, cloud(), atol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", COUNTED)
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
-def test_a_file_cut_off_is_refused(tmp_path: Path, name: str, share: float) -> None:
-    path = written(tmp_path, name)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(CloudError, match=path.name):
-        read_points(path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FORMATS)
-def test_a_damaged_file_is_read_or_refused(tmp_path: Path, name: str) -> None:
-    path = written(tmp_path, name, cloud(20))
-    raw = path.read_bytes()
-
-    # Half of all blows fall on the header, which is where a reader can go astray.
-    @settings(max_examples=3 if name in ("las", "laz") else 25)  # each LAS file takes a process
-    @given(st.integers(0, 300) | st.integers(0, len(raw) - 1), st.integers(0, 255))
-    def strike(place: int, value: int) -> None:
-        place %= len(raw)
-        path.write_bytes(raw[:place] + bytes([value]) + raw[place + 1 :])
-        try:
-            assert np.isfinite(read_points(path)).all()
-        except CloudError as error:
-            assert path.name in str(error)
-
-    strike()
-
-
-def test_a_las_file_that_would_take_the_reader_down_is_refused(tmp_path: Path) -> None:
-    path = written(tmp_path, "laz")
-    raw = path.read_bytes()
-    path.write_bytes(raw[:100] + b"\xff" * 4 + raw[104:])  # 4 billion records: laspy loops
-    with pytest.raises(CloudError, match="promises 4294967295 records"):
-        read_points(path)
-    points = int.from_bytes(raw[96:100], "little")
-    chunks = 4 + int.from_bytes(raw[points : points + 8], "little")
-    assert raw[chunks : chunks + 4] == (1).to_bytes(4, "little")  # 200 points are one chunk
-    path.write_bytes(raw[:chunks] + b"\xff" * 4 + raw[chunks + 4 :])  # 64 GiB: lazrs aborts
-    with pytest.raises(CloudError, match="laspy could not read it"):
-        read_points(path)
-
-
-def test_points_without_an_echo_are_left_out(tmp_path: Path) -> None:
-    points = cloud(6).astype(np.float32)
-    points[1, 2], points[4] = np.nan, np.inf
-    path = written(tmp_path, "binary pcd", points)
-    np.testing.assert_array_equal(read_points(path), points[[0, 2, 3, 5]])
-    path = written(tmp_path, "binary pcd", np.full((3, 3), np.nan, dtype=np.float32))
-    with pytest.raises(CloudError, match="none of the 3 points is finite"):
-        read_points(path)
-
-
-@pytest.mark.parametrize(
-    ("file", "text", "message"),
-    [
-        ("cloud.obj", "v 0 0 0", r"'.obj'; point clouds are .ply, .pcd, .las"),
-        ("cloud.xyz", "", "no line of numbers"),
-        ("cloud.xyz", "x y z\n", "no line of numbers"),
-        ("cloud.xyz", "1 2\n3 4\n", "copy or export it again"),
-        ("cloud.xyz", "1 2 3\n4 five 6\n", "five"),
-        ("cloud.ply", "not a ply", "corrupt or of another kind"),
-        ("cloud.las", "PK", "laspy could not read it .*export it again"),
-        ("cloud.npz", "PK", "corrupt or of another kind"),
-    ],
-)
-def test_bad_files_say_what_is_wrong(tmp_path: Path, file: str, text: str, message: str) -> None:
-    (tmp_path / file).write_text(text)
-    with pytest.raises(CloudError, match=message):
-        read_points(tmp_path / file)
-
-
-def test_missing_files_folders_fields_and_arrays_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(CloudError, match="check the path"):
-        read_points(tmp_path / "none.ply")
-    (tmp_path / "folder.las").mkdir()
-    with pytest.raises(CloudError, match="check the path"):
-        read_points(tmp_path / "folder.las")
-    flat = PointCloud.from_points(cloud()[:, :2], ("x", "y"), (np.float32, np.float32))
-    flat.save(tmp_path / "flat.pcd")
-    with pytest.raises(CloudError, match="without z"):
-        read_points(tmp_path / "flat.pcd")
-    np.savez(tmp_path / "other.npz", heights=np.zeros((2, 2)))
-    with pytest.raises(CloudError, match="'points', found heights"):
-        read_points(tmp_path / "other.npz")
-    np.savez(tmp_path / "flat.npz", points=np.zeros((4, 2)))
-    with pytest.raises(CloudError, match=r"\(4, 2\)"):
-        read_points(tmp_path / "flat.npz")
-    np.savez(tmp_path / "pickle.npz", points=np.array([{}, []], dtype=object))
-    with pytest.raises(CloudError, match="allow_pickle"):
-        read_points(tmp_path / "pickle.npz")
-
-
-def test_points_are_saved_whole_as_npz_or_not_at_all(tmp_path: Path) -> None:
-    with pytest.raises(CloudError, match=r"saved as \.npz"):
-        save_points(cloud(), tmp_path / "cloud.ply")
-    with pytest.raises(StorageError, match="create the folder"):
-        save_points(cloud(), tmp_path / "missing" / "cloud.npz")
-    with pytest.raises(CloudError, match="shape"):
-        save_points(np.zeros(3), tmp_path / "cloud.npz")
-    assert list(tmp_path.iterdir()) == []
-
 
 # -- cells -----------------------------------------------------------------------------------------
 
@@ -274,6 +83,72 @@ def test_cells_begin_at_multiples_of_the_resolution_or_at_the_area() -> None:
     elevation = map_points(points, config=config, area=(-0.25, 1.0, 0.2, 1.2)).elevation
     assert elevation.origin == (-0.25, 1.0) and elevation.shape == (5, 2)
     assert np.argwhere(elevation.known).tolist() == [[0, 0]]
+
+
+POSTS = np.indices((40, 40)).reshape(2, -1).repeat(2, axis=1).T
+"""Two posts for every cell."""
+
+
+@pytest.mark.parametrize("step", [0.05, 0.1, 0.2, 0.03, 1.0, 0.3048])
+@pytest.mark.parametrize("origin", [(0, 0), (-1, -3), (500000, 4649776), (500000.35, 5648298.15)])
+def test_points_on_borders_fill_every_cell(step: float, origin: tuple[float, float]) -> None:
+    # As decimals are written, and as LAS computes them: a whole number times scale plus offset.
+    first = np.round(np.array(origin) / step) * step
+    written = np.char.mod("%.6f", POSTS * step + first).astype(float)
+    computed = (POSTS * round(step * 1e4)) * 1e-4 + first
+    for xy in (written, computed):
+        height = np.where(POSTS[:, 0] >= 20, 0.1, 0.0)
+        points = np.column_stack((xy, height))
+        scanned = map_points(points, config=ScanConfig(resolution=step))
+        assert scanned.elevation.shape == (40, 40) and (scanned.count == 2).all()
+        np.testing.assert_allclose(scanned.elevation.heights[:, 0], height[::80], atol=2e-4)
+        area = (*first, *(first + 40 * step))
+        scanned = map_points(points, config=ScanConfig(resolution=step), area=area)
+        assert scanned.elevation.shape == (40, 40) and (scanned.count == 2).all()
+        assert scanned.outside == 0
+        x, y = xy[160]
+        assert scanned.elevation.cell_of(x, y) == (2, 0)
+
+
+@given(st.integers(1, 400), st.integers(-(10**8), 10**8), st.integers(0, 10**6))
+def test_cells_are_those_of_exact_integers(cell: int, offset: int, seed: int) -> None:
+    # Coordinates to the centimetre, anywhere up to 1000 km away.
+    whole = np.random.default_rng(seed).integers(0, 5 * cell, (30, 2)) + offset
+    points = np.column_stack((whole * 0.01, np.zeros(30)))
+    config = ScanConfig(resolution=cell / 100, neighbours=0, min_points=1)
+    scanned = map_points(points, config=config)
+    expected = whole // cell - (whole // cell).min(axis=0)
+    found = np.argwhere(scanned.count)
+    assert {*map(tuple, found)} == {*map(tuple, expected.tolist())}
+    assert scanned.elevation.origin == pytest.approx((whole // cell).min(axis=0) * cell / 100)
+
+
+def test_what_lies_outside_the_area_is_counted_and_its_last_cell_is_whole() -> None:
+    points = np.array([(x, 0.5, 0.0) for x in (-0.01, 0.0, 0.5, 1.02, 1.04, 1.05, 9)]).repeat(2, 0)
+    scanned = map_points(points, config=ScanConfig(neighbours=0), area=(0, 0, 1.03, 1))
+    assert scanned.elevation.shape == (21, 20)
+    assert scanned.outside == 6 and scanned.count.sum() == 8 and scanned.count[20, 10] == 4
+
+
+def test_points_in_cells_with_too_few_are_counted() -> None:
+    points = np.array([(0, 0, 0), (0.01, 0, 0), (0.07, 0, 0), (0, 0.07, 0)], dtype=float)
+    scanned = map_points(points)
+    assert scanned.sparse == 2 and scanned.elevation.known.sum() == 1
+
+
+def test_places_in_messages_are_given_to_the_centimetre() -> None:
+    points = cloud() + np.array((500000, 4649776, 0))
+    with pytest.raises(CloudError, match=r"y 46497\d\d\.\d\d\.\.46497\d\d\.\d\d m"):
+        map_points(points, area=(0, 0, 1, 1))
+
+
+def test_neighbours_are_searched_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = cloud(2000)
+    whole = map_points(points, config=ScanConfig(outlier_ratio=0.1, resolution=0.1))
+    monkeypatch.setattr(scanning, "_DISTANCES", 500)
+    parts = map_points(points, config=ScanConfig(outlier_ratio=0.1, resolution=0.1))
+    assert 0 < parts.outliers == whole.outliers
+    np.testing.assert_array_equal(parts.count, whole.count)
 
 
 def test_the_order_of_the_points_does_not_matter() -> None:
@@ -371,7 +246,14 @@ def test_a_ceiling_is_no_ground_but_a_table_is() -> None:
         (cloud(), {"area": (1, 1, 0, 2)}, "is empty"),
         (1e3 * cloud(), {}, "check that it is in metres"),
         (1e9 * cloud(), {}, "too far for voxels"),
-        (1e300 * cloud(), {}, "too far for voxels"),
+        (1e300 * cloud(), {}, "subtract an offset"),
+        (np.full((5, 3), 1.7e308), {}, "subtract an offset"),
+        (cloud() * (1, 1, 1e12), {}, "too far for voxels|heights reach"),
+        (cloud(), {"area": (0, 0, math.inf, 2)}, "area.*finite"),
+        (cloud(), {"area": (0, math.nan, 1, 2)}, "area.*finite"),
+        (cloud(), {"area": (0, 0, 1e9, 1e9)}, f"more than {MOST_CELLS}"),
+        (cloud(), {"area": (0, 0, 1e-300, 1e300)}, f"more than {MOST_CELLS}"),
+        (cloud(3), {"config": ScanConfig(resolution=0.001)}, "too large"),
     ],
 )
 def test_unusable_clouds_are_refused(points: np.ndarray, fields: dict, message: str) -> None:
@@ -387,52 +269,17 @@ def test_unusable_clouds_are_refused(points: np.ndarray, fields: dict, message: 
         {"neighbours": -1},
         {"min_points": 0},
         {"outlier_ratio": math.nan},
+        {"outlier_ratio": math.inf},
         {"clearance": 0.0},
+        {"clearance": math.nan},
+        {"resolution": math.inf},
+        {"resolution": 1e300},
+        {"resolution": "0.1"},
+        {"neighbours": 10**6},
+        {"neighbours": 2.5},
+        {"min_points": 10**12},
     ],
 )
 def test_settings_that_cannot_work_are_refused(fields: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(fields))):
         ScanConfig(**fields)
-
-
-# -- the command -----------------------------------------------------------------------------------
-
-
-def command(*options: object) -> mapping.MapConfig:
-    return tyro.cli(mapping.MapConfig, args=[str(option) for option in options])
-
-
-def test_map_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points = sheet()
-    path, out, statistics = (tmp_path / name for name in ("c.laz", "m.npz", "s.npz"))
-    write_las(path, points[points[:, 0] > 0.2])
-    options = ("--out", out, "--statistics", statistics, "--area", 0, 0, 1, 0.6)
-    assert mapping.run(command(path, *options)) == 0
-    elevation = ElevationMap.load(out)
-    assert elevation.shape == (20, 12)
-    assert not elevation.known[:4].any() and elevation.known[4:].all()
-    assert np.isnan(elevation.heights[:4]).all()
-    with np.load(statistics) as file:
-        assert set(file) == {"count", "lowest", "p95", "variance"}
-        assert file["count"].sum() == (points[:, 0] > 0.2).sum()
-    printed = capsys.readouterr().out
-    assert "20.0% of the cells are unknown" in printed and "4 points (median)" in printed
-
-    assert mapping.run(command(path, *options, "--fill")) == 0
-    filled = ElevationMap.load(out)
-    assert np.isfinite(filled.heights).all()
-    np.testing.assert_array_equal(filled.known, elevation.known)
-
-
-def test_map_command_refuses_early_and_keeps_the_old_map(tmp_path: Path) -> None:
-    out = tmp_path / "map.npz"
-    out.write_text("old")
-    with pytest.raises(CloudError, match="check the path"):
-        mapping.run(command(tmp_path / "none.las", "--out", out))
-    # Before it reads the cloud, which is not there either.
-    with pytest.raises(StorageError, match="create the folder"):
-        mapping.run(command(tmp_path / "none.las", "--out", tmp_path / "no" / "map.npz"))
-    save_points(sheet(), tmp_path / "cloud.npz")
-    with pytest.raises(MapError, match=r"\.bmp"):
-        mapping.run(command(tmp_path / "cloud.npz", "--out", tmp_path / "map.bmp"))
-    assert out.read_text() == "old"
