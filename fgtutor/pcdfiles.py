@@ -45,10 +45,16 @@ def read_pcd(path: Path) -> Cloud:
     repeats = [whole_number(text, "COUNT") for text in counts]
     where = [fields.index(axis) for axis in "xyz" if fields.count(axis) == 1]
     kinds = [f"{types[i].upper()}{sizes[i]}" for i in where]
-    if len(where) != 3 or any(repeats[i] != 1 for i in where) or not {*kinds} <= _TYPES:
+    if len(where) != 3:
         shown = ", ".join(fields)[:60]
-        lacks = ", ".join(axis for axis in "xyz" if axis not in fields) or "a number for each"
-        raise CloudError(f"the fields are {shown!r}, without {lacks}: expected x, y and z once")
+        lacks = ", ".join(axis for axis in "xyz" if axis not in fields)
+        raise CloudError(f"the fields are {shown!r}, without {lacks or 'one of each'} of x, y, z")
+    if any(repeats[i] != 1 for i in where) or not {*kinds} <= _TYPES:
+        several = ", ".join(str(repeats[i]) for i in where)
+        raise CloudError(
+            f"x, y and z should be one number each, the header gives them TYPE and SIZE "
+            f"{', '.join(kinds)[:40]!r} and COUNT {several}"
+        )
     points = _points(header)
     before = [sum(repeats[:i]) for i in where]
     notes = _viewpoint(header)
