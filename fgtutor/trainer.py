@@ -12,6 +12,7 @@ import ctypes
 import io
 import math
 import time
+import warnings
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -300,7 +301,8 @@ class Trainer:
 
     def _take_over(self, state: dict[str, Any], own: dict[str, Any]) -> None:
         """Set everything to what a checkpoint holds, and to what it holds of this process."""
-        self.algorithm.load(state["algorithm"])
+        with warnings.catch_warnings(action="ignore"):  # torch warns of what it then refuses
+            self.algorithm.load(state["algorithm"])
         if strange := self._strange_weights():
             raise ValueError(strange)
         self.samples_before, self.critic_warmup = state["samples_before"], state["critic_warmup"]
@@ -308,7 +310,7 @@ class Trainer:
         self.algorithm.get_policy().requires_grad_(not warm)
         self.iteration, self.seconds = state["iteration"], state["seconds"]
         self.saved, self.easiest = self.iteration, state["easiest"]
-        self._renew(own["env"])
+        self._renew(dict(own["env"]))
         self.history = state["history"]
         torch.set_rng_state(own["torch_random"])
 
