@@ -167,10 +167,10 @@ def damage_zip(rng: random.Random, data: bytes, other: bytes) -> bytes:
     if not headers:
         return damage_bytes(rng, data, other)
     if rng.random() < 0.1:
-        changed = bytearray(data)
+        changed = bytearray(data + bytes(8))
         for start, signature in headers:
             changed[start + _ZIP_FIELDS[signature][0][0]] |= signature != b"PK\5\6"
-        return bytes(changed)
+        return bytes(changed[:-8])
     start, signature = rng.choice(headers)
     at, size = rng.choice(_ZIP_FIELDS[signature])
     return poke(rng, data, start + at, size)

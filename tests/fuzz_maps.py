@@ -234,6 +234,7 @@ def damage_png(rng: random.Random, data: bytes, other: bytes) -> bytes:
 
 _YAML_RAW = (
     *(raw for raw in RAW if len(raw) < 35_000),  # YAML reads a long list in seconds
+    "[" * 18_000,
     *(f"!!python/object/apply:os.mkdir [{MARKER}]", "!!python/name:os.system", "*a", "&a [*a]"),
     *("!!binary aGVsbG8=", "!!set {a}", "2001-01-01", "0o17", "1:30:00", ".inf", ".nan", "~"),
     *("!!float x", "{? [a] : b}"),
