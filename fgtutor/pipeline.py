@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
 from fgtutor.elevation import ElevationMap
@@ -113,7 +114,7 @@ class PlanConfig:
     """Use only these specialists; default: all."""
     taus: Literal["paper", "calibrated"] = "calibrated"
     """Thresholds of w_ood: the paper's, or each specialist's own."""
-    f_min: Positive = 0.1
+    f_min: Annotated[float, Interval(gt=0, le=1)] = 0.1
     """Edges less feasible than this do not exist."""
     cost: Cost = "length"
     """Edge cost: 1 / F_max times the step's length, or 1 / F_max alone (the paper)."""
