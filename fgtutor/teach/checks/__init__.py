@@ -41,7 +41,7 @@ class Shown(str):
 def check(question: str, answer: Any, *, seed: int = 0, cases: int = CASES) -> Verdict:
     """Try a function, or a number, and say at once what became of it.
 
-    Another `seed` draws other cases. Raises `ConfigError` if there is no such question.
+    Another `seed` draws other cases. Raises `ConfigError` if there is no such question, or no case.
     """
     asked = find(question)
     arguments = asked.cases(seed, cases)

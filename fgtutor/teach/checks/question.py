@@ -10,19 +10,24 @@ import inspect
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Interval
 
 from fgtutor.errors import ConfigError
 from fgtutor.teach.asking import CRASHED, NOT_STARTED, TOO_SLOW
 from fgtutor.teach.values import decode, describe, difference
-from fgtutor.validation import CountOrZero, parse_record
+from fgtutor.validation import CountOrZero, Seed, check_arguments, parse_record
 
 PASSED, WRONG = "passed", "wrong"
 OUTCOMES: tuple[str, ...] = (PASSED, NOT_STARTED, WRONG, CRASHED, TOO_SLOW)
+LONGEST = 5000
+"""Most characters of a text that is shown; no path is longer."""
 CASES = 10
 """Drawn cases of a question, unless the instructor wants more."""
+Cases = Annotated[int, Interval(ge=1, le=10_000)]
+"""How many cases are drawn; with none, any answer would be right."""
 
 
 @dataclass(frozen=True)
@@ -73,12 +78,17 @@ class Question:
             return self.name
         return f"{self.name}({', '.join(inspect.signature(self.truth).parameters)})"
 
-    def cases(self, seed: int = 0, count: int = CASES) -> list[tuple] | None:
-        """Return the arguments of every case; the same for one seed. None for a number to find."""
+    def cases(self, seed: Seed = 0, cases: Cases = CASES) -> list[tuple] | None:
+        """Return the arguments of every case; the same for one seed. None for a number to find.
+
+        Raises:
+            ConfigError: Nothing, or more than makes sense, would be drawn, or the seed is none.
+        """
+        check_arguments(Question.cases, locals())
         if self.draw is None:
             return None
-        dice = np.random.default_rng((seed, zlib.crc32(self.id.encode())))
-        return [*self.examples, *(self.draw(dice) for _ in range(count))]
+        rng = np.random.default_rng((seed, zlib.crc32(self.id.encode())))
+        return [*self.examples, *(self.draw(rng) for _ in range(cases))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,10 +203,20 @@ def answers_of(function: Callable[..., Any], cases: Sequence[tuple] | None) -> l
         return [function(*copy.deepcopy(arguments)) for arguments in cases]
 
 
-def plain_text(text: Any) -> str:
-    """Return text without the control characters by which it could pass for something else."""
-    kept = (c for c in str(text)[:4000] if c == "\n" or c.isprintable())
-    return "".join(kept)
+def plain_text(text: Any, *, kept: str = "\n\\") -> str:
+    """Return text in which all that cannot be seen, or turns others around, is escaped.
+
+    So a name or a message cannot pass for something else on a terminal or in a file.
+    """
+    return "".join(
+        c if c in kept or (c.isprintable() and c != "\\") else c.encode("unicode_escape").decode()
+        for c in str(text)[:LONGEST]
+    )
+
+
+def plain_name(name: Any) -> str:
+    """Return a path or name in one line as `plain_text`, so that no two of them look the same."""
+    return plain_text(name, kept="")
 
 
 def _short(value: Any) -> str:
