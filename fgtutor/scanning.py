@@ -141,6 +141,7 @@ def map_points(
     Raises:
         CloudError: There are no points, none lies in the area, no cell has enough of them, they
             are stored too coarsely for the cells, or the map would be absurdly large.
+        MapError: The coordinates are too large for the cells.
     """
     config = config or ScanConfig()
     check_arguments(map_points, {"area": area}, CloudError)

@@ -6,7 +6,6 @@ Sources: OGC 12-063r5 (WKT), OGC 19-008 (GeoTIFF keys), EPSG's units of measure.
 
 import math
 import re
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -55,6 +54,8 @@ def units_of_crs(crs: "CRS", error: type[FgtutorError]) -> Units:
     if "Pseudo-Mercator" in wkt or "Mercator_Auxiliary_Sphere" in wkt:
         raise error(f"{name} stretches lengths: project the coordinates to UTM or the like")
     plane, *vertical = re.split(r"VERT_CS\[|VERTCRS\[", wkt)
+    if vertical and re.search(r", *DOWN\]", vertical[0], re.IGNORECASE):
+        raise error(f"z is a depth ({name}), not a height: turn its sign")
     # The last unit of the plane's part is its own; those before it belong to what it rests on.
     return Units(_units(plane)[-1], _units(vertical[0])[0] if vertical else None)
 
@@ -91,9 +92,12 @@ def units_of_geokeys(
         units = units_of_crs(_crs("from_epsg", keys[3072], error), error)
     plane, up = stated(3076) or units.plane, stated(4099) or units.up
     if up is None and keys.get(4096, 0) not in (0, _OWN):
-        # Writers also put numbers of datums here, which say nothing of the unit.
-        with suppress(FgtutorError):
-            up = units_of_crs(_crs("from_epsg", keys[4096], error), error).up
+        try:
+            vertical = _crs("from_epsg", keys[4096], error)
+        except error:
+            pass  # writers also put numbers of datums here, which say nothing of the unit
+        else:
+            up = units_of_crs(vertical, error).up
     return Units(plane, up)
 
 

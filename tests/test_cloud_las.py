@@ -110,6 +110,8 @@ def test_geokeys_count_if_the_header_does_not_say_that_wkt_does(tmp_path: Path) 
         (geokeys((3072, 0, 4326)), "degrees .*WGS 84"),
         (geokeys((1024, 0, 3)), "geocentric"),
         (geokeys((3072, 0, 3857)), "stretches"),
+        (geokeys((3072, 0, UTM), (4096, 0, 5715)), "depth .*turn its sign"),
+        (wkt(UTM, 5715), "depth .*turn its sign"),
         (geokeys((3072, 0, 1)), "not known .*convert to metres"),
         (geokeys((3076, 0, 9099)), "unit 9099 .* is not known"),
         (geokeys((3076, 0, 32767)), "unit 32767 .* is not known"),
