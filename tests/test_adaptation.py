@@ -279,9 +279,9 @@ def test_the_table_says_where_nothing_was_reached(make_climber):
 def test_what_cannot_work_is_refused(tmp_path):
     with pytest.raises(TerrainError, match="wheelbarrow"):
         make_map("wheelbarrow", 1)
-    with pytest.raises(ConfigError, match="^maps: "):
+    with pytest.raises(ConfigError, match=r"^maps: "):
         AdaptationConfig(maps=0)
-    with pytest.raises(ConfigError, match="^heights: 1: should be greater than or equal to 0, got -0.2"):
+    with pytest.raises(ConfigError, match=r"^heights: 1: .*got -0\.2"):
         AdaptationConfig(heights=(0.1, -0.2, 0.3))
     with pytest.raises(SpecialistError, match="nowhere"):
         run(AdaptationConfig(zoo=tmp_path / "nowhere"))

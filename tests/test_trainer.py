@@ -60,7 +60,7 @@ def test_the_default_folder_names_the_seed():
 
 
 def test_one_process_trains_in_a_folder_at_a_time(copy):
-    with locked_folder(copy), pytest.raises(StorageError, match=r"another process \(\d+\) works in"):
+    with locked_folder(copy), pytest.raises(StorageError, match=r"process \(\d+\) works in"):
         train(replace(TINY, out=copy, resume=True))
     assert train(replace(TINY, out=copy, resume=True)).provenance["iteration"] == 4
 
