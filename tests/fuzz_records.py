@@ -218,10 +218,13 @@ def notebooks() -> list[Case]:
 
 
 def use_notebook(folder: Path) -> None:
-    from fgtutor.teach.grading import read_submission
+    from fgtutor.teach.submissions import exercise_of, read_submission
 
-    exercise, cells = read_submission(folder / "ex06_ada.ipynb")
-    assert exercise in ("", "ex06") and all(isinstance(cell, str) for cell in cells)
+    path = folder / "ex06_ada.ipynb"
+    content = read_submission(path)
+    assert isinstance(content.cells, list) and all(isinstance(cell, str) for cell in content.cells)
+    assert len(content.damage) < 300 and content.damage.isprintable()
+    assert exercise_of(path, folder, content.exercise) == "ex06"
 
 
 # Checkpoints --------------------------------------------------------------------------------------
