@@ -7,16 +7,28 @@ heights at points and derived maps. Source: the paper's M in R^(W x H), Sec. III
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Annotated, Any, Self
 
 import numpy as np
+from annotated_types import Interval
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from fgtutor import mapfiles
 from fgtutor.errors import MapError, OffMapError
-from fgtutor.grid import cells_of, coordinate_text, point_text
+from fgtutor.grid import cells_of, check_cells, coordinate_text, point_text
+from fgtutor.validation import NonNegative, check_arguments, check_fields
+
+Resolution = Annotated[float, Interval(ge=1e-3, le=1e6)]
+"""Side of a cell, m. Less than a millimetre is no metre: degrees, in all likelihood."""
+_Place = Annotated[float, Interval(ge=-1e12, le=1e12)]
+_HIGHEST = 25_000.0
+"""Greatest height and depth, m; twice what the Earth has. Beyond, numbers mean something else."""
+_NO_HEIGHT = -9999.0
+"""What many programs write where they know no height; nothing lies exactly so deep."""
+_WIDEST_WINDOW = 10_000
+"""Cells; the window of `smoothed` is made in the square of the time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,31 +36,37 @@ class ElevationMap:
     """Heights on a regular grid, indexed [ix, iy]; z up, metres.
 
     Raises:
-        MapError: The heights are not a 2-D grid of at least 2 x 2 cells, hold an infinity, or are
-            all unknown; or the resolution, the origin or `known` does not fit.
+        MapError: The heights are not a 2-D grid of at least 2 x 2 real numbers, are no heights in
+            metres, or are all unknown; or the resolution, the origin or `known` does not fit.
     """
 
     heights: Float[np.ndarray, "nx ny"]
-    """Height of each cell, m; NaN where it was never observed. Kept as a read-only float32 copy."""
-    resolution: float = 0.1
+    """Height of each cell, m; NaN (or masked) where it was never observed. Kept as a read-only
+    float32 copy."""
+    resolution: Resolution = 0.1
     """Side of a cell, m."""
-    origin: tuple[float, float] = (0.0, 0.0)
+    origin: tuple[_Place, _Place] = (0.0, 0.0)
     """Lower-left corner (not centre) of cell (0, 0), m."""
     known: Bool[np.ndarray, "nx ny"] = None  # pyright: ignore[reportAssignmentType]
     """Which cells were observed; default: those that are not NaN."""
 
     def __post_init__(self) -> None:
+        for name in ("resolution", "origin"):  # arrays and tensors as Python's numbers
+            value: Any = getattr(self, name)
+            value = value.tolist() if hasattr(value, "tolist") else value
+            object.__setattr__(self, name, tuple(value) if isinstance(value, list) else value)
+        check_fields(self, MapError)
         heights = _as_heights(self.heights)
-        resolution = float(self.resolution)
-        if not (math.isfinite(resolution) and resolution > 0):
-            raise MapError(f"resolution must be a positive number of metres, got {self.resolution}")
-        origin = tuple(float(value) for value in self.origin)
-        if len(origin) != 2 or not all(math.isfinite(value) for value in origin):
-            raise MapError(f"origin must be two finite numbers (x, y) in metres, got {self.origin}")
+        resolution, origin = float(self.resolution), tuple(map(float, self.origin))
+        # Farther out, floats lie too far apart to tell the cells from each other.
+        farthest = max(abs(o) + n * resolution for o, n in zip(origin, heights.shape, strict=True))
+        if farthest * 2.0**-52 > 1e-5 * resolution:
+            raise MapError(
+                f"coordinates of {farthest:.0f} m are too large for cells of {resolution:g} m: "
+                "subtract an offset from them"
+            )
         observed = ~np.isnan(heights)
-        known = observed if self.known is None else np.array(self.known, dtype=bool)
-        if known.shape != heights.shape:
-            raise MapError(f"known has shape {known.shape}, the heights have {heights.shape}")
+        known = observed if self.known is None else _as_truths(self.known, heights.shape)
         if (known & ~observed).any():
             ix, iy = np.argwhere(known & ~observed)[0]
             raise MapError(f"cell ({ix}, {iy}) is marked known but its height is NaN")
@@ -131,11 +149,18 @@ class ElevationMap:
     def height_at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Interpolate heights bilinearly between cell centres; beyond them the edge cell continues.
 
-        `x` and `y` broadcast. The result is NaN where a cell that carries weight is NaN.
+        `x` and `y` broadcast. The result is NaN where a cell that carries weight is NaN, or where
+        the point is NaN or masked.
+
+        Raises:
+            MapError: These are no real numbers.
         """
         (nx, ny), (x0, y0) = self.shape, self.origin
-        u = np.clip((np.asarray(x, dtype=float) - x0) / self.resolution - 0.5, 0, nx - 1)
-        v = np.clip((np.asarray(y, dtype=float) - y0) / self.resolution - 0.5, 0, ny - 1)
+        with np.errstate(over="ignore"):
+            u = np.clip((as_numbers(x, "x") - x0) / self.resolution - 0.5, 0, nx - 1)
+            v = np.clip((as_numbers(y, "y") - y0) / self.resolution - 0.5, 0, ny - 1)
+        nowhere = np.isnan(u) | np.isnan(v)
+        u, v = np.nan_to_num(u), np.nan_to_num(v)
         i = np.minimum(u.astype(int), nx - 2)
         j = np.minimum(v.astype(int), ny - 2)
         a, b = u - i, v - j
@@ -145,7 +170,7 @@ class ElevationMap:
                 # 0 * NaN is NaN: an unknown neighbour without weight must not spread.
                 weight = wi * wj
                 total = total + np.where(weight > 0, weight * self.heights[i + di, j + dj], 0.0)
-        return total
+        return np.where(nowhere, np.nan, total)
 
     def filled(self) -> Self:
         """Return the map with every unknown cell at the nearest known height; `known` is kept."""
@@ -154,7 +179,7 @@ class ElevationMap:
         _, (ix, iy) = ndimage.distance_transform_edt(~self.known, return_indices=True)  # pyright: ignore
         return self._replace(self.heights[ix, iy], known=self.known)
 
-    def levelled(self, depth: float, reach: float) -> Self:
+    def levelled(self, depth: NonNegative, reach: NonNegative) -> Self:
         """Return the map with deep holes raised to `depth` below the ground around them.
 
         A hole has higher ground on both sides: the ground around it is the grey closing of the map
@@ -163,13 +188,14 @@ class ElevationMap:
         cell continues.
 
         Raises:
-            MapError: Some height is NaN (call `filled` first), or a number is negative or NaN.
+            MapError: Some height is NaN (call `filled` first), a number is negative or not finite,
+                or `reach` is too far.
         """
-        if not (depth >= 0 and reach >= 0):
-            raise MapError(f"levelled needs depth >= 0 and reach >= 0 m, got {depth} and {reach}")
+        check_arguments(ElevationMap.levelled, locals(), MapError)
         if np.isnan(self.heights).any():
             raise MapError("levelled needs a height in every cell: call filled() first")
-        cells = round(reach / self.resolution)
+        cells = round(min(reach / self.resolution, 1e9))
+        check_cells([n + 4 * cells for n in self.shape])
         square = (2 * cells + 1, 2 * cells + 1)
         # Closed on a padded map: scipy's own border would erode what it has just dilated.
         padded = np.pad(self.heights, 2 * cells, mode="edge")
@@ -177,20 +203,26 @@ class ElevationMap:
         inside = tuple(slice(2 * cells, 2 * cells + n) for n in self.shape)
         highest = closed[inside]
         return self._replace(
-            np.maximum(self.heights, highest - np.float32(depth)), known=self.known
+            np.maximum(self.heights, highest - np.float32(min(depth, 2 * _HIGHEST))),
+            known=self.known,
         )
 
-    def smoothed(self, width: float) -> Self:
+    def smoothed(self, width: NonNegative) -> Self:
         """Return the map seen through a triangular window that reaches `width` to each side, m.
 
         Sampled every `width` metres, the map as it is would hide where between two samples an edge
         lies; smoothed, its height there tells. A width of one cell or less changes nothing.
 
         Raises:
-            MapError: Some height is NaN (call `filled` first), or the width is negative or NaN.
+            MapError: Some height is NaN (call `filled` first), or the width is negative, not finite
+                or more than ten thousand cells.
         """
-        if not width >= 0:
-            raise MapError(f"smoothed needs a width of 0 m or more, got {width}")
+        check_arguments(ElevationMap.smoothed, locals(), MapError)
+        if width > _WIDEST_WINDOW * self.resolution:
+            raise MapError(
+                f"a window of {width:g} m is wider than {_WIDEST_WINDOW} cells of "
+                f"{self.resolution:g} m: choose a smaller width"
+            )
         if np.isnan(self.heights).any():
             raise MapError("smoothed needs a height in every cell: call filled() first")
         cells = round(width / self.resolution)
@@ -207,34 +239,40 @@ class ElevationMap:
         """Return the cells whose centres lie in the rectangle, which may reach beyond the map.
 
         Raises:
-            MapError: Fewer than 2 x 2 cells are left.
+            MapError: Fewer than 2 x 2 cells are left, or a corner is NaN.
         """
-        x, y = self.centres
-        ix = np.flatnonzero((x >= x0) & (x <= x1))
-        iy = np.flatnonzero((y >= y0) & (y <= y1))
-        if len(ix) < 2 or len(iy) < 2:
-            raise MapError(
-                f"crop to {point_text((x0, y0, x1, y1), self.resolution)} m leaves {len(ix)} x "
-                f"{len(iy)} cells of the map over {point_text(self.extent, self.resolution)} m; at "
-                "least 2 x 2 are needed"
-            )
-        window = slice(ix[0], ix[-1] + 1), slice(iy[0], iy[-1] + 1)
-        corner_x, corner_y = self.centre_of(int(ix[0]), int(iy[0]))
         half = 0.5 * self.resolution
+        first = [corner + half for corner in self.origin]
+        # The first centre from x0 on is the last one, turned over, so a border holds on both sides.
+        low = -cells_of((-x0, -y0), [-centre for centre in first], self.resolution)
+        high = cells_of((x1, y1), first, self.resolution)
+        low, high = np.maximum(low, 0), np.minimum(high, np.array(self.shape) - 1)
+        if (high - low < 1).any():
+            nx, ny = np.maximum(high - low + 1, 0)
+            raise MapError(
+                f"crop to {point_text((x0, y0, x1, y1), self.resolution)} m leaves {nx} x {ny} "
+                f"cells of the map over {point_text(self.extent, self.resolution)} m; at least 2 x "
+                "2 are needed"
+            )
+        window = slice(low[0], high[0] + 1), slice(low[1], high[1] + 1)
+        corner_x, corner_y = self.centre_of(int(low[0]), int(low[1]))
         return self._replace(
             self.heights[window],
             known=self.known[window],
             origin=(corner_x - half, corner_y - half),
         )
 
-    def resample(self, resolution: float) -> Self:
+    def resample(self, resolution: Resolution) -> Self:
         """Return the map on cells of another size: bilinear heights, the origin kept.
 
         A new cell is known, and has a height, where the old cell at its centre was known. The area
         shrinks or grows by less than half a new cell where its size is no multiple of theirs.
+
+        Raises:
+            MapError: The resolution is no positive length, or leaves too few or too many cells.
         """
-        if not (math.isfinite(resolution) and resolution > 0):
-            raise MapError(f"resolution must be a positive number of metres, got {resolution}")
+        check_arguments(ElevationMap.resample, locals(), MapError)
+        check_cells([round(length / resolution) for length in self.size])
         steps = [
             (np.arange(max(round(length / resolution), 1)) + 0.5) * resolution
             for length in self.size
@@ -256,7 +294,11 @@ class ElevationMap:
         The height at a point p is afterwards the height at R p, R the rotation by 90 k degrees; so
         the new origin is the lower-left corner of the turned rectangle: for k = 1 the old corner
         (x0, y0 + width) goes to (-(y0 + width), x0). Headings shift by 2 k.
+
+        Raises:
+            MapError: `k` is no whole number.
         """
+        check_arguments(ElevationMap.rotated90, locals(), MapError)
         x0, y0, x1, y1 = self.extent
         origin = ((x0, y0), (-y1, x0), (-x1, -y1), (y0, -x1))[k % 4]
         # np.rot90 turns the first axis towards the second: x towards y, counter-clockwise.
@@ -296,20 +338,52 @@ class ElevationMap:
             raise MapError(f"{path}: {error}") from error
 
 
-def _as_heights(values: object) -> np.ndarray:
-    """Return a float32 copy of the heights, or say what is wrong with them."""
+def as_numbers(values: Any, name: str) -> np.ndarray:
+    """Return real numbers as an array of floats, without a gradient; masked ones are NaN.
+
+    Raises:
+        MapError: They are not real numbers, or form no array.
+    """
     try:
-        with np.errstate(over="ignore"):
-            heights = np.array(values, dtype=np.float32)
-    except (TypeError, ValueError) as error:
-        raise MapError(f"heights must be a grid of numbers [nx, ny]: {error}") from error
-    if heights.ndim != 2 or min(heights.shape) < 2:
-        raise MapError(f"a map needs at least 2 x 2 cells [nx, ny], got shape {heights.shape}")
-    infinite = np.isinf(heights)
-    if infinite.any():
-        ix, iy = np.argwhere(infinite)[0]
+        with np.errstate(all="ignore"):
+            # A list of masked rows keeps its masks only so.
+            numbers: Any = np.ma.asarray(_detached(values))
+    except Exception as error:  # whatever a foreign type raises
+        raise MapError(f"{name} must be a grid of numbers: {error}") from error
+    if numbers.dtype.kind not in "fiu":
+        raise MapError(f"{name} must be a grid of numbers that are real, got {numbers.dtype}")
+    if numbers.dtype.kind != "f":
+        numbers = numbers.astype(np.float64)
+    return numbers.filled(np.nan)
+
+
+def _detached(values: Any) -> Any:
+    """Return a tensor without its gradient, anything else as it is."""
+    return values.detach().cpu() if hasattr(values, "detach") else values
+
+
+def _as_truths(values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return which cells are known, as a copy; masked ones are not."""
+    known: Any = np.ma.asarray(_detached(values))
+    if known.dtype.kind != "b":
+        raise MapError(f"known must hold True or False for each cell, got {known.dtype}")
+    if known.shape != shape:
+        raise MapError(f"known has shape {known.shape}, the heights have {shape}")
+    return np.array(known.filled(False))
+
+
+def _as_heights(values: Any) -> np.ndarray:
+    """Return a float32 copy of the heights, or say what is wrong with them."""
+    numbers = as_numbers(values, "heights")
+    if numbers.ndim != 2 or min(numbers.shape) < 2:
+        raise MapError(f"a map needs at least 2 x 2 cells [nx, ny], got shape {numbers.shape}")
+    low, high = np.fmin.reduce(numbers, axis=None), np.fmax.reduce(numbers, axis=None)
+    if low < -_HIGHEST or high > _HIGHEST or (numbers == _NO_HEIGHT).any():
+        wrong = (np.abs(numbers) > _HIGHEST) | (numbers == _NO_HEIGHT)
+        ix, iy = np.argwhere(wrong)[0]
         raise MapError(
-            f"cell ({ix}, {iy}) has an infinite height ({infinite.sum()} such cells): mark unknown "
-            "cells with NaN"
+            f"cell ({ix}, {iy}) has a height of {numbers[ix, iy]:g} m ({wrong.sum()} such cells): "
+            "if it stands for no data, declare it in the file or mark unknown cells with NaN; else "
+            "check the unit"
         )
-    return heights
+    return np.array(numbers, dtype=np.float32)

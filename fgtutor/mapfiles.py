@@ -1,33 +1,37 @@
-"""Files that hold an elevation map: .npz, GeoTIFF, and 16-bit PNG with a YAML sidecar.
+"""Files that hold an elevation map: .npz, GeoTIFF, and grey PNG with a YAML sidecar.
 
-Reads a path and gives the fields of an `ElevationMap`, or the other way round. Images run row by
-row from north to south, maps [ix, iy] from south to north; only this file turns one into the other.
-GeoTIFF (OGC 19-008): heights as float32, NaN for unknown cells.
+Reads a path and gives the fields of an `ElevationMap`, or the other way round. What a file says
+about its numbers is obeyed, or the file is refused; so it is if it says what is not understood.
 """
 
-import math
-import warnings
+import hashlib
+import stat
+import struct
 import zipfile
-import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 from PIL import Image
 
 from fgtutor.errors import MapError
-from fgtutor.storage import atomic_write
+from fgtutor.geotiff import load_geotiff, save_geotiff
+from fgtutor.grid import check_cells
+from fgtutor.rasters import decoding, heights_of, rows_of
+from fgtutor.storage import atomic_write, atomic_write_all
+from fgtutor.validation import parse_record
 
 if TYPE_CHECKING:
     from fgtutor.elevation import ElevationMap
 
-_READ_ERRORS = (
-    *(OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, MemoryError),
-    *(SyntaxError, zipfile.BadZipFile, zlib.error, yaml.YAMLError, NotImplementedError),
-)
-"""What numpy, Pillow (SyntaxError), rasterio and YAML raise on damaged files."""
+_LARGEST_SIDECAR = 4_000
+"""Bytes; ours have three hundred, and YAML takes seconds for nested ones."""
+_UNKNOWN = 65535
+"""The PNG value of an unknown cell; heights use 0..65534."""
+_PARTS = ("heights", "known", "resolution", "origin")
 
 
 def write(elevation: "ElevationMap", path: Path) -> None:
@@ -44,99 +48,91 @@ def read(path: Path) -> dict[str, Any]:
     """Return the arguments of the `ElevationMap` that a file holds.
 
     Raises:
-        MapError: The file is missing, of another kind, corrupt, or says too little.
+        MapError: The file is missing, cannot be read, is of another kind, corrupt or too large, or
+            says too little, or something about its numbers that cannot be obeyed.
     """
     load = _codec(path)[1]
-    if not path.is_file():
-        raise MapError(f"there is no map file {path}: check the path")
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise MapError(f"{path} is a folder or a device: give the path of a map file")
+        path.open("rb").close()
+    except FileNotFoundError:
+        raise MapError(f"there is no map file {path}: check the path") from None
+    except OSError as error:
+        raise MapError(f"cannot read {path}: {error.strerror}; check its permissions") from error
     try:
         return load(path)
     except MapError as error:
         raise MapError(f"{path}: {error}") from error
-    except _READ_ERRORS as error:
-        raise MapError(
-            f"cannot read {path} as a {path.suffix} map ({type(error).__name__}: {error}); the "
-            "file is corrupt or of another kind: write it again with ElevationMap.save"
-        ) from error
 
 
 def _save_npz(elevation: "ElevationMap", path: Path) -> None:
     with atomic_write(path) as temporary:
-        np.savez_compressed(
-            temporary,
-            heights=elevation.heights,
-            known=elevation.known,
-            resolution=elevation.resolution,
-            origin=elevation.origin,
-        )
+        np.savez_compressed(temporary, **{name: getattr(elevation, name) for name in _PARTS})
 
 
+@decoding
 def _load_npz(path: Path) -> dict[str, Any]:
-    # Opened here, because np.load leaves a file open that turns out not to be an archive.
-    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-        return {
-            "heights": file["heights"],
-            "known": file["known"],
-            "resolution": float(file["resolution"]),
-            "origin": tuple(file["origin"].tolist()),
-        }
+    with path.open("rb") as raw, zipfile.ZipFile(raw) as archive:
+        expected = sorted(f"{name}.npy" for name in _PARTS)
+        if sorted(archive.namelist()) != expected:
+            found = ", ".join(map(repr, archive.namelist()[:8])) or "nothing"
+            raise MapError(f"a map holds {', '.join(expected)}, this file holds {found[:300]}")
+        for name in expected:  # all of them, before memory is taken for one
+            with archive.open(name) as file:
+                shape, kind = _header(file)
+            wanted = "b" if name == "known.npy" else "fiu"
+            if kind.kind not in wanted or kind.itemsize > 8:
+                raise MapError(
+                    f"{name} holds {kind}, no {'truths' if wanted == 'b' else 'numbers'}"
+                )
+            check_cells(shape)
+        parts = {name: _array(archive, f"{name}.npy") for name in _PARTS}
+    if parts["resolution"].ndim or parts["origin"].shape != (2,):
+        raise MapError("the resolution must be one number, and the origin two")
+    return parts | {
+        "resolution": float(parts["resolution"]),
+        "origin": tuple(float(value) for value in parts["origin"]),
+    }
 
 
-def _observed(elevation: "ElevationMap") -> np.ndarray:
-    return np.where(elevation.known, elevation.heights, np.float32(np.nan))
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    """Return shape and type of a .npy file without its data."""
+    version = np.lib.format.read_magic(file)
+    if version != (1, 0):  # newer ones are for records with many or foreign names
+        raise MapError(f"the arrays are of version {version}: save them as plain numbers")
+    shape, _, kind = np.lib.format.read_array_header_1_0(file)
+    return shape, kind
 
 
-def _save_geotiff(elevation: "ElevationMap", path: Path) -> None:
-    import rasterio
-    from rasterio.io import MemoryFile
-
-    x0, _, _, y1 = elevation.extent
-    step = elevation.resolution
-    # GDAL reports a full disk late or not at all, so it writes to memory and Python to the disk.
-    with MemoryFile() as memory:
-        with memory.open(
-            driver="GTiff",
-            width=elevation.shape[0],
-            height=elevation.shape[1],
-            count=1,
-            dtype="float32",
-            nodata=math.nan,
-            compress="deflate",
-            transform=rasterio.Affine(step, 0.0, x0, 0.0, -step, y1),
-        ) as file:
-            # A raster's rows go from north to south: transpose [ix, iy], then turn upside down.
-            file.write(_observed(elevation).T[::-1], 1)
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(memory.getbuffer())
+def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    with archive.open(name) as file:
+        array = np.lib.format.read_array(file, allow_pickle=False)
+        if file.read(1):  # at its end the checksum is compared
+            raise MapError(f"{name} is longer than it says")
+    return array
 
 
-def _load_geotiff(path: Path) -> dict[str, Any]:
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning
+@dataclass(frozen=True, kw_only=True)
+class Sidecar:
+    """What a PNG's numbers mean: height = offset + scale * value, metres."""
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an error of ours, just below
-        with rasterio.open(path, driver="GTiff") as file:
-            place = file.transform
-            if place.is_identity:
-                raise MapError("the TIFF has no georeference, so its resolution is unknown")
-            if file.crs is not None and file.crs.is_geographic:
-                raise MapError(f"the raster is in degrees ({file.crs}): reproject it to metres")
-            if place.b or place.d or place.a <= 0 or not math.isclose(place.a, -place.e):
-                raise MapError(f"the raster must be north-up with square cells, got {tuple(place)}")
-            rows = file.read(1, masked=True).astype(np.float32).filled(np.nan)
-            # To the nanometre: the lower edge is a difference of rounded numbers.
-            origin = place.c, round(place.f + file.height * place.e, 9)
-    # Rows go from north to south: turn them over, then transpose to [ix, iy].
-    return {"heights": rows[::-1].T, "resolution": place.a, "origin": origin}
-
-
-_UNKNOWN = 65535
-"""The PNG value of an unknown cell; heights use 0..65534."""
+    scale: float
+    """Height of a step, m."""
+    offset: float
+    """Height of the value 0, m."""
+    resolution: float
+    """Side of a cell, m."""
+    origin: tuple[float, float]
+    """Lower-left corner, m."""
+    unknown: int | None = _UNKNOWN
+    """The value of unknown cells, if there is one."""
+    picture: str | None = None
+    """SHA-256 of the PNG; a sidecar written by hand needs none."""
 
 
 def _save_png(elevation: "ElevationMap", path: Path) -> None:
-    heights = _observed(elevation).astype(float)
+    heights = rows_of(elevation).astype(float)
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
     scale = (high - low) / (_UNKNOWN - 1) or 1.0
     values = np.round((heights - low) / scale)
@@ -148,36 +144,87 @@ def _save_png(elevation: "ElevationMap", path: Path) -> None:
         "origin": list(elevation.origin),
         "unknown": _UNKNOWN,
     }
-    # Both files are complete on the disk before either takes its name.
-    with atomic_write(_sidecar(path)) as sidecar, atomic_write(path) as temporary:
-        sidecar.write_text("# height = offset + scale * value, metres\n" + yaml.safe_dump(notes))
-        # An image's rows go from north to south: transpose [ix, iy], then turn upside down.
-        rows = np.ascontiguousarray(values.T[::-1])
-        Image.fromarray(rows).save(temporary, format="PNG")
+    with atomic_write_all(path, _sidecar(path)) as (picture, sidecar):
+        Image.fromarray(values).save(picture, format="PNG")
+        notes["picture"] = _digest(picture)
+        sidecar.write_text(
+            f"# height = offset + scale * value, metres\n{yaml.safe_dump(notes)}", encoding="utf-8"
+        )
 
 
 def _load_png(path: Path) -> dict[str, Any]:
-    sidecar = _sidecar(path)
-    if not sidecar.is_file():
+    notes = _read_sidecar(_sidecar(path))
+    with path.open("rb") as file:
+        head = file.read(26)
+    if len(head) == 26 and head[12:16] == b"IHDR":  # before Pillow takes memory
+        width, height, depth, colour = struct.unpack(">IIBB", head[16:])
+        check_cells((width, height))
+        if depth < 8 or colour:
+            raise MapError(
+                f"a height image has one channel of grey of 8 or 16 bits, this one has {depth} "
+                f"bits and {_COLOURS.get(colour, 'unknown colours')}"
+            )
+    if notes.picture not in (None, _digest(path)):
         raise MapError(
-            f"a PNG holds no metres: put scale, offset, resolution, origin and unknown in {sidecar}"
+            f"it is not the picture that {_sidecar(path).name} describes: write it again with "
+            "ElevationMap.save (or delete the line `picture`, if you changed it on purpose)"
         )
-    notes = yaml.safe_load(sidecar.read_text())
-    missing = {"scale", "offset", "resolution", "origin"} - set(notes or ())
-    if missing:
-        raise MapError(f"{sidecar.name} lacks {', '.join(sorted(missing))}")
+    values, clear = _picture(path)
+
+    def strip(rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        some = values[rows]
+        return some, np.logical_and(*(some != one for one in (notes.unknown, clear)))
+
+    heights = heights_of(values.shape, strip, notes.scale, notes.offset)
+    return {"heights": heights, "resolution": notes.resolution, "origin": notes.origin}
+
+
+@decoding
+def _picture(path: Path) -> tuple[np.ndarray, int | None]:
+    """Return the values of a grey picture, and which of them is transparent."""
     with Image.open(path, formats=["PNG"]) as image:
-        if image.mode not in ("I;16", "I;16B", "I", "L"):
-            raise MapError(f"a height image has one channel of grey, this one is {image.mode}")
-        values = np.asarray(image)
-    heights = float(notes["offset"]) + float(notes["scale"]) * values.astype(float)
-    heights[values == notes.get("unknown", _UNKNOWN)] = np.nan
-    # Rows go from north to south: turn them over, then transpose to [ix, iy].
-    return {
-        "heights": heights[::-1].T,
-        "resolution": float(notes["resolution"]),
-        "origin": tuple(notes["origin"]),
-    }
+        check_cells(image.size)  # a second header may say otherwise
+        if image.mode not in ("L", "I", "I;16", "I;16B") or getattr(image, "is_animated", False):
+            raise MapError(f"it must hold one picture in grey, this one is {image.mode}")
+        return np.asarray(image), image.info.get("transparency")
+
+
+_COLOURS = {0: "grey", 2: "colours", 3: "a palette", 4: "grey and alpha", 6: "colours and alpha"}
+
+
+def _read_sidecar(path: Path) -> Sidecar:
+    if not path.is_file():
+        raise MapError(
+            f"a PNG holds no metres: put scale, offset, resolution, origin and unknown in {path}"
+        )
+    return parse_record(Sidecar, _notes(path), MapError, path.name)
+
+
+@decoding
+def _notes(path: Path) -> dict[str, Any]:
+    """Return what a small YAML file maps to what."""
+    with path.open("rb") as file:
+        text = file.read(_LARGEST_SIDECAR + 1)
+    if len(text) > _LARGEST_SIDECAR:
+        raise MapError(f"{path.name} has more than {_LARGEST_SIDECAR} bytes")
+    loader = yaml.SafeLoader(text)
+    tree = loader.get_single_node()
+    # Nothing within lists: parts that refer to parts could make a tree of a few lines endless.
+    if not isinstance(tree, yaml.MappingNode) or any(
+        not isinstance(part, yaml.ScalarNode)
+        for _, node in tree.value
+        for part in (node.value if isinstance(node, yaml.SequenceNode) else [node])
+    ):
+        raise MapError(f"{path.name} must hold lines such as `scale: 0.001` and `origin: [0, 0]`")
+    notes = loader.construct_document(tree)
+    if len(tree.value) != len(notes):  # of two equal keys YAML takes the last
+        raise MapError(f"{path.name} gives a key twice")
+    return notes
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _sidecar(path: Path) -> Path:
@@ -186,8 +233,8 @@ def _sidecar(path: Path) -> Path:
 
 _CODECS = {
     ".npz": (_save_npz, _load_npz),
-    ".tif": (_save_geotiff, _load_geotiff),
-    ".tiff": (_save_geotiff, _load_geotiff),
+    ".tif": (save_geotiff, load_geotiff),
+    ".tiff": (save_geotiff, load_geotiff),
     ".png": (_save_png, _load_png),
 }
 
@@ -198,5 +245,6 @@ def _codec(path: Path) -> tuple[Callable, Callable]:
         return _CODECS[path.suffix.lower()]
     except KeyError:
         raise MapError(
-            f"{path} has the suffix {path.suffix!r}; maps are {', '.join(_CODECS)} files"
+            f"{path} has {f'the suffix {path.suffix!r}' if path.suffix else 'no suffix'}; maps are "
+            f"{', '.join(_CODECS)} files"
         ) from None
