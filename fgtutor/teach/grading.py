@@ -6,28 +6,50 @@ here, against answers worked out here. Hidden cases follow from the seed: there 
 """
 
 import json
-import re
+import os
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
+from typing import Annotated
 
 import tyro
-from tqdm import tqdm
+from annotated_types import Interval
 
-from fgtutor.errors import ConfigError, GradingError, NotebookError
+from fgtutor.errors import ConfigError, GradingError, NotebookError, StorageError
 from fgtutor.machine import usable_cores
+from fgtutor.progress import watch
 from fgtutor.storage import atomic_write, check_writable, make_folder, write_json
 from fgtutor.teach.checks import EXERCISES, questions_of
-from fgtutor.teach.checks.question import CASES, Judge, plain_text
+from fgtutor.teach.checks.question import CASES, Cases, Judge, plain_name, plain_text
 from fgtutor.teach.confinement import WALLS
-from fgtutor.teach.marks import KEY, Mark, by_learner, gradescope, report, table
+from fgtutor.teach.marks import (
+    KEY,
+    Mark,
+    by_learner,
+    gradescope,
+    report,
+    report_names,
+    settle_clashes,
+    table,
+)
 from fgtutor.teach.sandbox import Limits, ask_submission, check_system
+from fgtutor.teach.submissions import (
+    UNREADABLE,
+    Rule,
+    base_of,
+    exercise_of,
+    find_notebooks,
+    learners_of,
+    read_submission,
+)
 from fgtutor.teach.values import encode
+from fgtutor.validation import Seed, check_fields
 
-LARGEST_NOTEBOOK = 20_000_000
-"""Bytes; an exercise without outputs has ten thousand."""
+SHOWN = 20
+"""Files named of those that are not graded for the same reason."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,13 +64,18 @@ class GradeConfig:
     """Write Gradescope's results.json here."""
     reports: Path | None = None
     """Write a report per learner into this folder."""
-    seed: int = 0
+    seed: Seed = 0
     """What the hidden cases are drawn from: choose your own, and keep it to yourself."""
-    cases: int = CASES
+    cases: Cases = CASES
     """Hidden cases per question."""
     exercise: str = ""
-    """Grade all as this exercise; default: what a notebook's metadata or file name says."""
-    workers: int = 0
+    """Grade all as this exercise; default: what a notebook's metadata, its name (exNN between
+    anything but letters and digits) and its folder say, which must not disagree."""
+    learner: Rule = "path"
+    """Who a notebook is from: its path below the folder named here, without exNN and the mark of a
+    copy, so folder and file name (path); the file name alone (file); the folder alone (folder); or
+    all are one learner's, as on Gradescope (one). Of one learner and exercise the best counts."""
+    workers: Annotated[int, Interval(ge=0, le=1024)] = 0
     """Submissions side by side; 0 takes one per core that a container or affinity leaves us."""
     seconds: float = Limits.seconds
     """CPU time for all cases of a question, s."""
@@ -58,17 +85,14 @@ class GradeConfig:
     """Memory of a submission, MB."""
 
     def __post_init__(self) -> None:
-        if self.cases < 1 or self.workers < 0 or self.memory_mb < 512:
-            raise ConfigError(
-                "need cases >= 1, workers >= 0 and memory_mb >= 512 (numpy itself takes 400), got "
-                f"{self.cases}, {self.workers} and {self.memory_mb}"
-            )
-        if not (self.seconds > 0 and self.loading > 0):
-            raise ConfigError(
-                f"need seconds > 0 and loading > 0, got {self.seconds} and {self.loading}"
-            )
+        check_fields(self)
+        self.limits()
         if self.exercise and self.exercise not in EXERCISES:
             raise ConfigError(f"no exercise {self.exercise!r}: there are {', '.join(EXERCISES)}")
+
+    def limits(self) -> Limits:
+        """Return what a submission may use; raises `ConfigError` for what makes no sense."""
+        return Limits(seconds=self.seconds, loading=self.loading, memory_mb=self.memory_mb)
 
 
 class Examiner:
@@ -86,148 +110,170 @@ class Examiner:
         ]
 
 
-def grade(config: GradeConfig, *, progress: bool = False) -> list[Mark]:
-    """Return a mark for every notebook, in the order of their paths.
+def grade(
+    config: GradeConfig, notebooks: Sequence[Path] | None = None, *, progress: bool = False
+) -> list[Mark]:
+    """Return a mark for every notebook, by default all that `config.paths` hold, in their order.
 
     Raises:
         ConfigError: A path does not exist or holds no notebook, or the system cannot grade.
         MissingExtraError: IPython is not installed, in whose syntax cells are written.
     """
     check_system()
-    submissions = find_notebooks(config.paths)
-    read = [_read(path, config.exercise) for path in submissions]
-    wanted = sorted({exercise for exercise, _, _ in read if exercise})
+    if notebooks is None:
+        notebooks, skipped = find_notebooks(config.paths)
+        if not notebooks:
+            raise ConfigError(_nothing(config.paths, skipped))
+    read = _read(notebooks, config)
+    wanted = sorted({mark.exercise for mark, _ in read if not mark.fault})
     examiners = {name: Examiner(name, config.seed, config.cases) for name in wanted}
-    limits = Limits(seconds=config.seconds, loading=config.loading, memory_mb=config.memory_mb)
-
     stop = Event()
 
-    def one(number: int) -> Mark:
-        return _grade(submissions[number], *read[number], examiners, limits, stop)
+    def one(submission: tuple[Mark, list[str]]) -> Mark:
+        return _grade(*submission, examiners, config.limits(), stop)
 
     with ThreadPoolExecutor(config.workers or usable_cores()) as pool:
-        marks = pool.map(one, range(len(submissions)))
+        marks = pool.map(one, read)
         try:
-            return list(tqdm(marks, total=len(submissions), unit="notebook", disable=not progress))
+            watched = watch(marks, len(read), "grading", show=progress, unit="notebook")
+            return settle_clashes(list(watched))
         except BaseException:  # Ctrl-C: the pool waits for what runs, so that ends now
             stop.set()
             raise
 
 
-def find_notebooks(paths: Sequence[Path]) -> list[Path]:
-    """Return the notebooks among files and folders; raises `ConfigError` for a path without."""
-    found: list[Path] = []
-    for path in paths:
-        inside = sorted(path.rglob("*.ipynb")) if path.is_dir() else [path]
-        inside = [p for p in inside if p.is_file() and ".ipynb_checkpoints" not in p.parts]
-        if not inside:
-            raise ConfigError(f"{path} is no notebook and no folder with one: check the path")
-        found += inside
-    if not found:
-        raise ConfigError("name at least one notebook, or a folder of them")
-    return list(dict.fromkeys(found))
+def _nothing(paths: Sequence[Path], skipped: Mapping[Path, str]) -> str:
+    """Say that there is no notebook, and what there is instead."""
+    where = ", ".join(map(plain_name, paths)) or "no path"
+    there = "; ".join(_skips(skipped)) or "it is empty"
+    return f"no notebook in {where} ({there}): name one, or a folder of them"
 
 
-def read_submission(path: Path) -> tuple[str, list[str]]:
-    """Return what exercise a notebook says it is ("" if it does not) and its code cells.
-
-    Raises:
-        NotebookError: It is no notebook, or larger than any.
-    """
-    try:
-        if path.stat().st_size > LARGEST_NOTEBOOK:
-            raise NotebookError(f"larger than {LARGEST_NOTEBOOK} bytes: clear its outputs")
-        notebook = json.loads(path.read_bytes())
-        cells = [
-            "".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"
-        ]
-        own = notebook.get("metadata", {}).get("fgtutor", {})
-        exercise = own.get("exercise", "") if isinstance(own, dict) else ""
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
-        if isinstance(error, NotebookError):
-            raise
-        raise NotebookError(f"not a readable notebook ({type(error).__name__})") from error
-    match = re.search(r"ex\d\d", path.stem)
-    named = match[0] if match else ""
-    return next((name for name in (exercise, named) if name in EXERCISES), ""), cells
+def _skips(skipped: Mapping[Path, str]) -> list[str]:
+    """Return which files were not graded, a line per reason."""
+    groups: dict[str, list[str]] = defaultdict(list)
+    for path, reason in skipped.items():
+        groups[reason].append(plain_name(path))
+    return [
+        f"not graded, {reason}: {', '.join(names[:SHOWN])}"
+        + f" and {len(names) - SHOWN} more" * (len(names) > SHOWN)
+        for reason, names in groups.items()
+    ]
 
 
-def _read(path: Path, exercise: str) -> tuple[str, list[str], str]:
-    """Return exercise, cells and, if it cannot be graded, why."""
-    try:
-        said, cells = read_submission(path)
-    except NotebookError as error:
-        return exercise, [], str(error)
-    name = exercise or said
-    unknown = "" if name else "which exercise? Its metadata and name do not say: use --exercise"
-    return name, cells, unknown
+def _read(notebooks: Sequence[Path], config: GradeConfig) -> list[tuple[Mark, list[str]]]:
+    """Return for each notebook its code, and its mark so far: whose it is and what is wrong."""
+    base = base_of(config.paths)
+    read = []
+    for path, (learner, doubt) in zip(
+        notebooks, learners_of(notebooks, base, config.learner), strict=True
+    ):
+        mark, cells, said, damage = Mark(path=path, learner=learner), [], "", ""
+        try:
+            said, cells, damage = read_submission(path)
+        except NotebookError as error:
+            mark = replace(mark, fault=str(error))
+        except OSError as error:
+            mark = replace(mark, fault=f"{UNREADABLE}: {error.strerror or error}", not_run=True)
+        try:
+            exercise = config.exercise or exercise_of(path, base, said)
+            mark = replace(mark, exercise=exercise)
+        except NotebookError as error:
+            mark = replace(mark, fault=mark.fault or str(error))
+        notes = tuple(filter(None, (damage, doubt)))
+        read.append((replace(mark, notes=notes), cells))
+    return read
 
 
 def _grade(
-    path: Path,
-    exercise: str,
+    mark: Mark,
     cells: list[str],
-    fault: str,
     examiners: Mapping[str, Examiner],
     limits: Limits,
     stop: Event,
 ) -> Mark:
-    learner = learner_of(path)
-    if fault:
-        return Mark(path=path, learner=learner, exercise=exercise, fault=fault)
-    examiner = examiners[exercise]
+    if mark.fault:
+        return mark
+    examiner = examiners[mark.exercise]
     try:
         replies, in_force = ask_submission(cells, examiner.questions, limits, stop)
         verdicts = tuple(judge.judge(replies[judge.question.id]) for judge in examiner.judges)
     except GradingError as error:
-        fault = f"not graded: {error}"
-        return Mark(path=path, learner=learner, exercise=exercise, fault=fault, not_run=True)
-    except Exception as error:  # one submission never stops the batch, not even by our mistake
-        fault = f"the grader itself failed on it, look at it by hand: {error!r}"
-        fault = plain_text(fault)
-        return Mark(path=path, learner=learner, exercise=exercise, fault=fault, not_run=True)
-    return Mark(
-        path=path,
-        learner=learner,
-        exercise=exercise,
-        verdicts=verdicts,
-        in_force=tuple(plain_text(name) for name in in_force),
-    )
-
-
-def learner_of(path: Path) -> str:
-    """Return who a submission is from: its file name without the exercise, else its folder."""
-    own = re.sub(r"ex\d\d", "", path.stem).strip(" _-.")
-    return plain_text(own or path.resolve().parent.name)[:60]
+        return replace(mark, fault=f"not graded: {error}", not_run=True)
+    except Exception as error:  # what no submission can bring about stops no other one either
+        fault = f"not graded, by a mistake of fgtutor, please report it: {error!r}"
+        return replace(mark, fault=plain_text(fault), not_run=True)
+    return replace(mark, verdicts=verdicts, in_force=tuple(map(plain_text, in_force)))
 
 
 def run(config: GradeConfig) -> int:
-    """Grade from the command line: print the list or the report, and write what was asked for."""
-    for path in (config.csv, config.gradescope):
-        if path:
-            check_writable(path)
-    marks = grade(config, progress=True)
+    """Grade from the command line: write what was asked for, and print the list or the report.
+
+    Returns 1 if something could not be graded for a reason that is none of the learner.
+    """
+    notebooks, skipped = find_notebooks(config.paths)
+    _check_outputs(config, notebooks)
+    if not notebooks:
+        reason = _nothing(config.paths, skipped)
+        if config.gradescope:
+            write_json(config.gradescope, gradescope([], reason))
+        raise ConfigError(reason)
+    marks = grade(config, notebooks, progress=True)
     learners = by_learner(marks)
+    problems = _write(config, marks, learners)  # then print, as a reader may have seen enough
     if len(learners) == 1:
         print(report(marks))
     else:
         print("\n".join(map(str, marks)))
         print(f"{KEY}; {len(marks)} notebooks, seed {config.seed}, {config.cases} cases")
-    if config.csv:
-        _write(config.csv, table(marks))
-    if config.gradescope:
-        write_json(config.gradescope, gradescope(marks))
-    if config.reports:
-        make_folder(config.reports)
-        for name, own in learners.items():
-            safe = re.sub(r"[^\w-]+", "_", name)
-            _write(config.reports / f"{safe}.txt", report(own))
+        if config.gradescope:
+            print(f'{config.gradescope} has {len(learners)} results under "learners".')
+    if config.learner == "path" and (both := [name for name in learners if "/" in name]):
+        print(
+            f"{len(both)} learners, such as {both[0]}, are told apart by folder and file name: use "
+            "--learner file or --learner folder if only one of the two is a name"
+        )
+    for line in _skips(skipped):
+        print(line)
     lacking = {wall for mark in marks if mark.in_force for wall in WALLS - {*mark.in_force}}
     if lacking:
         print(f"This system lacks: {', '.join(sorted(lacking))}; see docs/instructor.md.")
-    return int(any(mark.not_run for mark in marks))
+    if problems:
+        raise StorageError("; ".join(problems))
+    unread = any(reason.startswith(UNREADABLE) for reason in skipped.values())
+    return int(unread or any(mark.not_run for mark in marks))
 
 
-def _write(path: Path, text: str) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+def _check_outputs(config: GradeConfig, notebooks: Sequence[Path]) -> None:
+    """Raise an error of ours if the results could not be written, before anything is graded."""
+    files = [path for path in (config.csv, config.gradescope) if path]
+    real = [os.path.realpath(path) for path in (*files, *notebooks)]
+    for path in files:
+        if real.count(os.path.realpath(path)) > 1:
+            raise ConfigError(f"{path} is to be written, but is a notebook or another output")
+        check_writable(path)
+    if config.reports:
+        make_folder(config.reports)
+        check_writable(config.reports / "report.txt")
+
+
+def _write(
+    config: GradeConfig, marks: Sequence[Mark], learners: Mapping[str, Sequence[Mark]]
+) -> list[str]:
+    """Write all that was asked for; return what could not be written, and why."""
+    texts: dict[Path, str] = {}
+    if config.csv:
+        texts[config.csv] = table(marks)
+    if config.gradescope:
+        texts[config.gradescope] = json.dumps(gradescope(marks), indent=1)
+    if config.reports:
+        names = report_names(learners)
+        texts |= {config.reports / names[name]: report(own) for name, own in learners.items()}
+    problems = []
+    for path, text in texts.items():
+        try:
+            with atomic_write(path) as temporary:
+                temporary.write_text(text, encoding="utf-8")
+        except StorageError as error:
+            problems.append(str(error))
+    return problems

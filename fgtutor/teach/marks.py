@@ -1,18 +1,23 @@
 """Marks: what became of each submission, as a report for a learner, a CSV and Gradescope's JSON.
 
 Reads verdicts; gives plain text. Nothing that a submission wrote is passed on as HTML, as a
-terminal command or as a spreadsheet formula.
+terminal command or as a spreadsheet formula. Of one learner and exercise at most one notebook
+counts; all others have no points, so that sums are right whoever adds them up.
 """
 
 import csv
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+import os
+import re
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-from fgtutor.teach.checks.question import OUTCOMES, Verdict
+from fgtutor.teach.checks.question import OUTCOMES, Verdict, plain_name
 
 INDENT = " " * 6
 _SIGN = dict(zip(OUTCOMES, "+.x!~", strict=True))
@@ -25,38 +30,76 @@ class Mark:
     path: Path
     """The submission."""
     learner: str
-    """Whose it is, from its file or folder name."""
-    exercise: str
+    """Whose it is, readable and unlike any other; see `submissions.learners_of`."""
+    exercise: str = ""
     """Such as "ex04"; empty if it could not be told."""
     verdicts: tuple[Verdict, ...] = ()
     """One a question, in order."""
     fault: str = ""
     """Why it could not be graded at all."""
+    notes: tuple[str, ...] = ()
+    """What somebody should look at: a clash, a doubtful name, damage."""
+    counts: bool = True
+    """Whether it is the one that counts of this learner and exercise."""
     not_run: bool = False
-    """Whether that is no fault of the submission: it is to be graded again."""
+    """Whether a fault is none of the submission: it is to be graded again."""
     in_force: tuple[str, ...] = ()
     """The protections under which it ran."""
 
     @property
-    def points(self) -> int:
-        """Points earned."""
+    def earned(self) -> int:
+        """Points earned, whether they count or not."""
         return sum(verdict.points for verdict in self.verdicts)
 
     @property
+    def points(self) -> int:
+        """Points that count."""
+        return self.earned if self.counts else 0
+
+    @property
     def out_of(self) -> int:
-        """Points that could be earned."""
-        return sum(verdict.question.points for verdict in self.verdicts)
+        """Points that could be earned and count."""
+        return sum(verdict.question.points for verdict in self.verdicts) if self.counts else 0
 
     @property
     def percent(self) -> float:
         """Share of the points, %."""
         return 100 * self.points / self.out_of if self.out_of else 0.0
 
+    @property
+    def remarks(self) -> str:
+        """The fault and the notes; "" if there are none."""
+        return "; ".join(filter(None, (self.fault, *self.notes)))
+
     def __repr__(self) -> str:
         """Read as one line of a list."""
         signs = "".join(_SIGN[verdict.outcome] for verdict in self.verdicts)
-        tail = self.fault or f"{self.points:>3} of {self.out_of:<3} {signs}"
-        return f"{self.learner:<24.24} {self.exercise:<5} {tail}"
+        points = f"{self.points:>3} of {self.out_of:<3}" if self.counts else " not counted"
+        tail = "" if self.fault else f"{points} {signs} "
+        tail += f"{self.remarks} [{plain_name(self.path)}]" if self.remarks else ""
+        return f"{self.learner:<24} {self.exercise:<5} {tail}".rstrip()
+
+
+def settle_clashes(marks: Sequence[Mark]) -> list[Mark]:
+    """Let only the best count of several notebooks of one learner and exercise, and say so.
+
+    Of equally good ones it is the first.
+    """
+    groups: dict[tuple[str, str], list[Mark]] = defaultdict(list)
+    for mark in marks:
+        groups[mark.learner, mark.exercise].append(mark)
+    settled = {}
+    for (_, exercise), group in groups.items():
+        best = max(group, key=lambda mark: (not mark.fault, mark.earned))
+        if exercise and len(group) > 1:
+            common = os.path.commonpath([os.path.abspath(mark.path.parent) for mark in group])
+            which = plain_name(os.path.relpath(os.path.abspath(best.path), common))
+            note = (
+                f"clash: {len(group)} notebooks for {exercise}, of which the best counts: {which}"
+            )
+            for mark in group:
+                settled[mark.path] = replace(mark, notes=(*mark.notes, note), counts=mark is best)
+    return [settled.get(mark.path, mark) for mark in marks]
 
 
 KEY = "  ".join(f"{sign} {outcome}" for outcome, sign in _SIGN.items())
@@ -67,9 +110,10 @@ def report(marks: Sequence[Mark]) -> str:
     """Return what one learner should read: every question, its outcome, and why."""
     lines = [f"{marks[0].learner}: {_total(marks)}", ""]
     for mark in marks:
-        lines += [f"{mark.exercise or 'unknown exercise'} ({mark.path.name})", "=" * 60]
-        if mark.fault:
-            lines += [mark.fault, ""]
+        lines += [f"{mark.exercise or 'unknown exercise'} ({plain_name(mark.path.name)})", "=" * 60]
+        lines += filter(None, (mark.fault, *mark.notes))
+        if mark.fault or not mark.counts:
+            lines.append("")
             continue
         lines += [f"{mark.points} of {mark.out_of} points, {mark.percent:.0f} %", ""]
         for verdict in mark.verdicts:
@@ -90,30 +134,56 @@ def table(marks: Sequence[Mark]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     questions = [f"q{number}" for number in range(1, widest + 1)]
-    head = ["learner", "submission", "exercise", "points", "out_of", "percent"]
-    writer.writerow([*head, *questions, "fault"])
+    head = ["learner", "submission", "exercise", "points", "out_of", "percent", "counts"]
+    writer.writerow([*head, *questions, "fault", "notes"])
     for mark in marks:
         outcomes = [verdict.outcome for verdict in mark.verdicts]
-        row = [mark.learner, str(mark.path), mark.exercise, mark.points, mark.out_of]
-        row += [f"{mark.percent:.1f}", *outcomes, *[""] * (widest - len(outcomes)), mark.fault]
+        row = [mark.learner, plain_name(mark.path), mark.exercise, mark.points, mark.out_of]
+        row += [f"{mark.percent:.1f}", "yes" if mark.counts and not mark.fault else "no"]
+        row += [*outcomes, *[""] * (widest - len(outcomes)), mark.fault, "; ".join(mark.notes)]
         writer.writerow([_harmless(cell) for cell in row])
     return buffer.getvalue()
 
 
 def _harmless(cell: Any) -> Any:
-    """Keep a spreadsheet from reading a learner's file name as a formula."""
-    return f"'{cell}" if isinstance(cell, str) and cell.startswith(tuple("=+-@\t\r")) else cell
+    """Keep a spreadsheet from reading a learner's file name as a formula, wide signs included."""
+    first = unicodedata.normalize("NFKC", cell[:1]) if isinstance(cell, str) else ""
+    return f"'{cell}" if first and first in "=+-@'\t\r\n" else cell
 
 
-def gradescope(marks: Sequence[Mark]) -> dict[str, Any]:
-    """Return Gradescope's results: of one learner its own format, of several one such each.
+def gradescope(marks: Sequence[Mark], nothing: str = "") -> dict[str, Any]:
+    """Return Gradescope's results: of one learner, or of `nothing` that could be graded, and why.
 
-    Source: the autograder documentation, "results.json".
+    Of several, whom Gradescope could not tell apart, they have no points and one such object each
+    under "learners". Source: the autograder documentation, "results.json".
     """
     learners = by_learner(marks)
     if len(learners) == 1:
         return _results(marks)
-    return {"learners": {name: _results(own) for name, own in learners.items()}}
+    some = ", ".join([*learners][:3]) + ", ..." * (len(learners) > 3)
+    said = nothing or (
+        f"{len(learners)} learners ({some}) in one submission: hand in only your own notebooks, "
+        "or grade with --learner one"
+    )
+    return {
+        **_results([], said),
+        **({"learners": {n: _results(own) for n, own in learners.items()}} if learners else {}),
+    }
+
+
+def report_names(learners: Iterable[str]) -> dict[str, str]:
+    """Return a file name for each learner's report, different on every file system."""
+    names: dict[str, str] = {}
+    taken = set()
+    for learner in learners:
+        safe = re.sub(r"[^\w-]+", "_", learner)[:50]
+        name, number = safe, 1
+        while (key := unicodedata.normalize("NFKD", name).casefold()) in taken:
+            number += 1
+            name = f"{safe}-{number}"
+        taken.add(key)
+        names[learner] = f"{name}.txt"
+    return names
 
 
 def by_learner(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
@@ -124,11 +194,11 @@ def by_learner(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
     return groups
 
 
-def _results(marks: Sequence[Mark]) -> dict[str, Any]:
-    faults = [f"{mark.path.name}: {mark.fault}" for mark in marks if mark.fault]
+def _results(marks: Sequence[Mark], said: str = "") -> dict[str, Any]:
+    remarks = [f"{plain_name(m.path.name)}: {m.remarks}" for m in marks if m.remarks]
     return {
         "score": sum(mark.points for mark in marks),
-        "output": "\n".join([_total(marks), *faults]),
+        "output": "\n".join([said or _total(marks), *remarks]),
         "output_format": "text",
         "test_output_format": "text",
         "tests": [
@@ -141,6 +211,7 @@ def _results(marks: Sequence[Mark]) -> dict[str, Any]:
                 "output_format": "text",
             }
             for mark in marks
+            if mark.counts
             for verdict in mark.verdicts
         ],
     }

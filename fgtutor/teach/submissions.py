@@ -144,8 +144,8 @@ def learners_of(notebooks: Sequence[Path], base: Path, rule: Rule) -> list[tuple
     return [
         (
             learner,
-            f"the name {plain_name(own)} is taken for {number} learners, as it is in different "
-            "folders: if it is one, use --learner file"
+            f"{plain_name(own)} is the name in different folders, taken for {number} learners: if "
+            "these are attempts of one, use --learner file"
             if own and rule == "path" and (number := len(alike[own])) > 1
             else "",
         )
@@ -231,15 +231,14 @@ def read_submission(path: Path) -> Content:
         metadata = {}
     cells = []
     for number, cell in enumerate(notebook["cells"], 1):
-        kind, source = (
-            (cell.get("cell_type"), cell.get("source")) if isinstance(cell, dict) else (None, None)
-        )
-        lines = source if isinstance(source, list) else [source]
-        if not isinstance(kind, str):
+        own = cell if isinstance(cell, dict) else {}
+        source: Any = own.get("source")
+        lines = [source] if isinstance(source, str) else source
+        if not isinstance(own.get("cell_type"), str):
             damage.append(f"cell {number} has no type")
-        elif not all(isinstance(line, str) for line in lines):
+        elif not (isinstance(lines, list) and all(isinstance(line, str) for line in lines)):
             damage.append(f"cell {number} has no source")
-        elif kind == "code":
+        elif own["cell_type"] == "code":
             cells.append("".join(lines))
     if sum(map(len, cells)) > LARGEST_CODE:
         raise NotebookError(f"more than {LARGEST_CODE} characters of code: hand in less")

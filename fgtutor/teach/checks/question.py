@@ -84,7 +84,7 @@ class Question:
         Raises:
             ConfigError: Nothing, or more than makes sense, would be drawn, or the seed is none.
         """
-        check_arguments(Question.cases, locals())
+        check_arguments(Question.cases, locals(), ConfigError)
         if self.draw is None:
             return None
         rng = np.random.default_rng((seed, zlib.crc32(self.id.encode())))
