@@ -53,7 +53,7 @@ def read_xyz(path: Path) -> Cloud:
             if not words:
                 continue
             if _COMMENT.match(words[0]):
-                head.append(_COMMENT.split(line.strip(), maxsplit=1)[1].strip("#/% "))
+                head.append(_COMMENT.split(line.strip(), maxsplit=1)[-1].strip("#/% "))
             elif names is None and numbers < min(3, len(words)):
                 names = line.strip()
             elif promised is None and len(words) == 1 and words[0].isdecimal():
