@@ -4,7 +4,7 @@
 #   make test       every test          make test-fast  those that take under a minute together
 #   make lab        JupyterLab on the first notebook, on this machine only
 #   make notebooks  execute the notebooks' sources     make exercises  build them from their masters
-#   make test-wheel build the wheel and run notebooks 01 and 06 against it in a fresh environment
+#   make test-wheel install wheel and source archive into fresh environments of each Python, and use them
 #   make check      lint, types, imports
 #   make clean      remove what the targets made (.venv too)
 # PYTHON=/path/to/python chooses the interpreter for .venv (3.11 to 3.14).
@@ -48,13 +48,8 @@ notebooks: $(ALL)
 exercises: $(ALL)
 	$(BIN)/fgtutor exercises
 
-test-wheel: $(ALL)
-	rm -rf build/wheel && $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheel .
-	$(BIN)/python -m venv build/wheel/venv
-	build/wheel/venv/bin/python -m pip install --quiet --constraint constraints.txt \
-	  "$$(echo build/wheel/*.whl)[lab]"
-	cp -r notebooks build/wheel/notebooks
-	cd build/wheel && venv/bin/fgtutor notebooks --names 01 06
+test-wheel:
+	.ci/test-wheel
 
 check: $(ALL)
 	$(BIN)/ruff check

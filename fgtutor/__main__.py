@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
 from fgtutor import __version__
@@ -108,9 +108,11 @@ def _run(command: str, options: Sequence[str]) -> int:
     """Import a command's module, let tyro fill its dataclass, and run it."""
     module_name, config_name, _ = COMMANDS[command]
     try:
-        from fgtutor.validation import parse_options  # here: `fgtutor --help` needs none of it
+        from fgtutor.progress import waiting  # here: `fgtutor --help` needs none of it
+        from fgtutor.validation import parse_options
 
-        module = importlib.import_module(f"fgtutor.{module_name}")
+        with waiting(f"fgtutor {command}: loading") if sys.stderr.isatty() else nullcontext():
+            module = importlib.import_module(f"fgtutor.{module_name}")
         config_class = getattr(module, config_name)
         if not isinstance(config_class, type):
             config_class = config_class(options)

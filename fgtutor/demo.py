@@ -15,6 +15,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import RenderingError
 from fgtutor.execution import execute
 from fgtutor.pipeline import plan_on_map
+from fgtutor.progress import waiting
 from fgtutor.specialist import load_zoo
 from fgtutor.storage import atomic_write, make_folder, write_json
 from fgtutor.teach.figures import plan_figure, save_figure
@@ -72,7 +73,7 @@ def run(config: DemoConfig) -> int:
 
     closed = ~torch.from_numpy(steps_on_known(elevation.known))
     weights, tensors = {}, {}
-    for name, assessment in assess_all(elevation, zoo).items():
+    for name, assessment in assess_all(elevation, zoo, progress=True).items():
         taus = resolve_taus(config.taus, zoo[name])
         weights[name], tensors[name] = assessment.ood(*taus), assessment.weighted(*taus)
         tensors[name][closed] = 0
@@ -85,9 +86,11 @@ def run(config: DemoConfig) -> int:
     save_figure(plan_figure(elevation, plan, weights), config.out / "plan.png")
     announce("plan.png", "the map and route, w_ood, F_max and the policy map")
 
-    episode = execute(plan.route, terrain, zoo, seed=config.seed)
+    with waiting("driving the route"):
+        episode = execute(plan.route, terrain, zoo, seed=config.seed)
     try:
-        film = save_video(episode, terrain, plan.route, config.out / f"drive.{config.video}")
+        with waiting("drawing the film"):
+            film = save_video(episode, terrain, plan.route, config.out / f"drive.{config.video}")
         announce(film.name, str(episode))
         with atomic_write(config.out / "drive.png") as path:
             film_strip(episode, terrain, plan.route).save(path)

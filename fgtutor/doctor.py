@@ -21,6 +21,7 @@ from annotated_types import Interval
 from fgtutor import __version__
 from fgtutor.errors import FgtutorError
 from fgtutor.machine import usable_cores
+from fgtutor.progress import waiting
 from fgtutor.robots import GL_BACKENDS
 from fgtutor.validation import check_fields
 
@@ -96,7 +97,8 @@ class Finding:
 
 def run(config: DoctorConfig) -> int:
     """Print the report; return 1 if something essential is broken, else 0."""
-    findings = list(examine(config))
+    with waiting("looking at this machine"):
+        findings = list(examine(config))
     print(report(findings))
     return int(any(finding.state == "broken" for finding in findings))
 

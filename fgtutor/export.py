@@ -25,6 +25,7 @@ from torch import Tensor
 
 from fgtutor.errors import ConfigError, ExportError, SpecialistError
 from fgtutor.patches import HOLE_DEPTH, SPACING
+from fgtutor.progress import waiting
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.specialist import Specialist, load_specialist
@@ -56,7 +57,8 @@ class ExportConfig:
 def run(config: ExportConfig) -> int:
     """Export from the command line and say what was written."""
     specialist = load_specialist(config.specialist)
-    difference = export_policy(specialist, config.out)
+    with waiting(f"exporting {specialist.name}"):
+        difference = export_policy(specialist, config.out)
     print(f"{specialist}: {specialist.policy.obs_dim} numbers in, {difference:.1e} from torch")
     print(f"policy -> {config.out}\ndescription -> {config.out.with_suffix('.json')}")
     return 0

@@ -5,8 +5,10 @@ under two seconds.
 """
 
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from tqdm import tqdm
@@ -35,6 +37,18 @@ def watch(
                 told, expected = True, spent * total / done
                 if expected > LONG:
                     tqdm.write(f"{what}: about {duration(expected)}", file=sys.stderr)
+
+
+@contextmanager
+def waiting(what: str) -> Iterator[threading.Timer]:
+    """Say `what` is being done if the block is not over at once, where its parts do not show."""
+    timer = threading.Timer(QUICK, lambda: print(f"{what} ...", file=sys.stderr, flush=True))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield timer
+    finally:
+        timer.cancel()
 
 
 def duration(seconds: float) -> str:

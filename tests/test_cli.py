@@ -189,7 +189,8 @@ def test_a_pipe_that_nobody_reads_is_no_error(tmp_path):
         check=False,
     )
     os.close(write)
-    assert done.returncode == cli.UNREAD and not done.stderr
+    assert done.returncode == cli.UNREAD
+    assert done.stderr in ("", "looking at this machine ...\n")  # the latter where it takes long
 
 
 def test_a_package_that_is_not_installed_gives_one_line(capsys, monkeypatch):

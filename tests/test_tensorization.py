@@ -313,13 +313,6 @@ def test_what_is_quick_shows_nothing(make_specialist, capsys):
     assert not capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("seconds", "words"), [(12.4, "12 s"), (89, "89 s"), (600, "10 min"), (9000, "2.5 h")]
-)
-def test_an_expected_time_is_round(seconds, words):
-    assert progress.duration(seconds) == words
-
-
 def test_why_blocked_sees_a_cell_walled_in_by_unknown_ones(make_specialist):
     heights = np.full((5, 5), np.nan)
     heights[2, 2] = heights[0, 0] = 0.0

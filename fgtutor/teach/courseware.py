@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fgtutor.errors import NotebookError
+from fgtutor.progress import waiting
 from fgtutor.storage import atomic_write, make_folder
 from fgtutor.teach.checks import EXERCISES, SOLUTIONS, questions_of
 from fgtutor.teach.notebooks import read_source
@@ -143,9 +144,11 @@ def outputs(config: ExercisesConfig) -> dict[Path, str]:
 
 def run(config: ExercisesConfig) -> int:
     """Write the files that changed, or say which ones would."""
+    with waiting("building the exercises"):
+        files = outputs(config)
     changed = [
         (path, text)
-        for path, text in outputs(config).items()
+        for path, text in files.items()
         if not path.is_file() or path.read_text(encoding="utf-8") != text
     ]
     for path, text in changed:

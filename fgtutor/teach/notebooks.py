@@ -23,6 +23,7 @@ from annotated_types import Interval
 from PIL import Image
 
 from fgtutor.errors import ConfigError, NotebookError
+from fgtutor.progress import waiting
 from fgtutor.robots import ROBOTS
 from fgtutor.specialist import DESCRIPTION, ZOO
 from fgtutor.storage import atomic_write, make_folder
@@ -269,7 +270,8 @@ def run(config: NotebooksConfig) -> int:
     make_folder(out)
     for source in sources:
         began = time.monotonic()
-        text = nbformat.writes(build(source, timeout=config.timeout)) + "\n"
+        with waiting(f"executing {source.name}"):
+            text = nbformat.writes(build(source, timeout=config.timeout)) + "\n"
         with atomic_write(out / f"{source.stem}.ipynb") as path:
             path.write_text(text, encoding="utf-8")
         seconds = time.monotonic() - began

@@ -69,7 +69,8 @@ def check_system() -> None:
         )
     if importlib.util.find_spec("IPython") is None:
         raise MissingExtraError(
-            "grading runs cells as Jupyter does and needs IPython: pip install 'fgtutor[lab]'"
+            "grading runs cells as Jupyter does and needs IPython, which is not installed here: in "
+            'the clone of fgtutor pip install -c constraints.txt -e ".[lab]"'
         )
 
 
