@@ -195,7 +195,7 @@ class ElevationMap:
         if np.isnan(self.heights).any():
             raise MapError("levelled needs a height in every cell: call filled() first")
         cells = round(min(reach / self.resolution, 1e9))
-        check_cells([n + 4 * cells for n in self.shape])
+        check_cells([4 * cells] * 2)  # what is laid around the map
         square = (2 * cells + 1, 2 * cells + 1)
         # Closed on a padded map: scipy's own border would erode what it has just dilated.
         padded = np.pad(self.heights, 2 * cells, mode="edge")

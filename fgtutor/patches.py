@@ -15,9 +15,10 @@ from annotated_types import Interval
 from jaxtyping import Float
 from torch import Tensor
 
-from fgtutor.elevation import ElevationMap
+from fgtutor.elevation import ElevationMap, Resolution
 from fgtutor.errors import ConfigError
-from fgtutor.validation import check_fields
+from fgtutor.grid import point_text
+from fgtutor.validation import check_arguments, check_fields
 
 HOLE_DEPTH = 0.3
 """Depth at which a hole counts as bottomless, m: deeper cells look alike to a patch."""
@@ -102,15 +103,27 @@ def sample_heights(
     heights: Float[Tensor, "nx ny"],
     xy: Float[Tensor, "*batch 2"],
     *,
-    resolution: float,
+    resolution: Resolution,
     origin: tuple[float, float],
 ) -> Float[Tensor, "*batch"]:
-    """Interpolate heights bilinearly at world points; beyond the border the edge cell continues."""
+    """Interpolate heights bilinearly at world points; beyond the border the edge cell continues.
+
+    A point that is NaN has the height NaN. Raises `ConfigError` if these are no floats, or floats
+    too coarse for the cells at coordinates as large as `origin`.
+    """
+    check_arguments(sample_heights, locals(), ConfigError)
+    if not (heights.is_floating_point() and xy.is_floating_point()):
+        raise ConfigError(f"heights and points must be floats, got {heights.dtype} and {xy.dtype}")
+    if max(map(abs, origin)) * torch.finfo(xy.dtype).eps > 0.1 * resolution:
+        raise ConfigError(
+            f"points in {xy.dtype} at the origin {point_text(origin, resolution)} m are coarser "
+            f"than cells of {resolution:g} m: subtract the origin, or use float64"
+        )
     nx, ny = heights.shape
     u = ((xy[..., 0] - origin[0]) / resolution - 0.5).clamp(0, nx - 1)
     v = ((xy[..., 1] - origin[1]) / resolution - 0.5).clamp(0, ny - 1)
-    i = u.long().clamp(max=max(nx - 2, 0))
-    j = v.long().clamp(max=max(ny - 2, 0))
+    i = u.long().clamp(0, max(nx - 2, 0))
+    j = v.long().clamp(0, max(ny - 2, 0))
     a, b = u - i, v - j
     flat, base = heights.reshape(-1), i * ny + j
     right, up = ny * (nx > 1), int(ny > 1)
@@ -143,14 +156,14 @@ def sample_patches(
     poses: Float[Tensor, "*batch 3"],
     grid: PatchGrid,
     *,
-    resolution: float,
+    resolution: Resolution,
     origin: tuple[float, float] = (0.0, 0.0),
 ) -> Float[Tensor, "*batch points"]:
     """Cut the yaw-aligned patch H_xy at each pose (x, y, yaw), relative to the ground beneath it.
 
     `heights` comes from a prepared map (see `prepare`). The rotation to the heading happens here,
-    so a patch always looks along the way the robot faces. Raises `ConfigError` if a pose or a
-    height near it is not finite, since a NaN would spread through the whole batch.
+    so a patch always looks along the way the robot faces. Raises `ConfigError` as `sample_heights`,
+    and if a pose or a height near it is not finite: a NaN would spread through the whole batch.
     """
     offsets = rotate(grid.points.to(heights), poses[..., 2])
     points = poses[..., None, :2] + offsets

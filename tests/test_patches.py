@@ -119,6 +119,28 @@ def test_turning_map_and_robot_together_changes_nothing(seed, quarter_turns, lif
     torch.testing.assert_close(one, other, atol=1e-6, rtol=0)
 
 
+def test_a_point_that_is_nan_has_no_height_on_a_map_of_any_shape():
+    for shape in ((4, 4), (5, 3), (3, 7), (1, 1)):
+        xy = torch.tensor([[math.nan, 0.1], [0.1, math.nan], [0.1, 0.1]])
+        found = sample_heights(torch.ones(shape), xy, resolution=0.1, origin=(0.0, 0.0))
+        assert found.isnan().tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("heights", "poses", "fields", "message"),
+    [
+        (torch.zeros(4, 4, dtype=torch.int64), torch.zeros(3), {}, "must be floats"),
+        (torch.zeros(4, 4), torch.zeros(3), {"resolution": 0.0}, "resolution"),
+        (torch.zeros(4, 4), torch.zeros(3), {"resolution": math.nan}, "resolution"),
+        (torch.zeros(4, 4), torch.zeros(3), {"origin": (math.inf, 0.0)}, "origin"),
+        (torch.zeros(4, 4), torch.zeros(3), {"origin": (5e5, 4649776.0)}, "4649776.00.*float64"),
+    ],
+)
+def test_inputs_that_cannot_work_are_refused(heights, poses, fields, message):
+    with pytest.raises(ConfigError, match=message):
+        sample_patches(heights, poses, GRID, **({"resolution": 0.1} | fields))
+
+
 @pytest.mark.parametrize("bad", ["heights", "pose"])
 def test_nan_does_not_spread_silently(bad):
     heights, pose = torch.zeros(4, 4), torch.zeros(3)
