@@ -27,8 +27,3 @@ NAMES = ("+x", "+x+y", "+y", "-x+y", "-x", "-x-y", "-y", "+x-y")
 def opposite(heading: int) -> int:
     """Return the heading that points the other way."""
     return (heading + NUM_HEADINGS // 2) % NUM_HEADINGS
-
-
-def nearest_heading(yaw: float) -> int:
-    """Return the heading closest to `yaw` (radians, any number of turns)."""
-    return round(yaw / (math.pi / 4)) % NUM_HEADINGS
