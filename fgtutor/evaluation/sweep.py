@@ -39,7 +39,6 @@ from fgtutor.evaluation.success import TrialsConfig, by_cell, cut, make_ground
 from fgtutor.evaluation.trials import drive
 from fgtutor.machine import usable_cores
 from fgtutor.recipe import A1TrainConfig, TrainConfig, comparable, training_world
-from fgtutor.recipe import config_of as recipe_of
 from fgtutor.robots import env_class
 from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist
 from fgtutor.storage import make_folder
@@ -47,9 +46,8 @@ from fgtutor.terrain import SCALES
 from fgtutor.trainer import CHECKPOINT, Trainer, give_back_memory
 from fgtutor.validation import Seed, Unique, parse_options
 
-COMMAND = "sweep"
-RUNS = "runs"
-"""Where in the report folder the run folders lie."""
+COMMAND, RUNS = "sweep", "runs"
+"""Its name, and where in the report folder the run folders lie."""
 WATCH_SECONDS = 10.0
 """How often to look how far they are, s."""
 OURS_TO_SET = {
@@ -125,7 +123,7 @@ def config_of(words: Sequence[str]) -> type[SweepConfig]:
         name = word.partition("=")[0].removeprefix("--train.").replace("-", "_")
         if word.startswith("--train.") and name in OURS_TO_SET:
             raise _set_elsewhere(name)
-    return A1SweepConfig if recipe_of(words) is A1TrainConfig else SweepConfig
+    return A1SweepConfig if training.config_of(words) is A1TrainConfig else SweepConfig
 
 
 def _set_elsewhere(name: str) -> ConfigError:
