@@ -327,8 +327,11 @@ class ElevationMap:
     def load(cls, path: str | Path) -> Self:
         """Read a map from .npz, .tif / .tiff or .png (which needs its sidecar `path`.yaml).
 
+        A GeoTIFF is converted to metres by the units, scale and offset that it states.
+
         Raises:
-            MapError: The file is missing, of another kind, corrupt, or says too little.
+            MapError: The file is missing, of another kind, corrupt, too large, says too little, or
+                says something of its numbers that cannot be obeyed (degrees, several bands).
         """
         path = Path(path)
         fields = mapfiles.read(path)
