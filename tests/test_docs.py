@@ -1,8 +1,12 @@
 """The pages that people read first: links lead somewhere, commands are understood, code runs."""
 
 import importlib
+import os
 import re
 import shlex
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -10,6 +14,7 @@ import pytest
 from fgtutor import __main__ as cli
 
 ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 LESSONS = sorted((ROOT / "notebooks" / "src").glob("*.py"))
 
@@ -48,9 +53,38 @@ def test_every_page_with_commands_was_read():
     assert not silent & {"README.md", "a1.md", "cluster.md", "instructor.md", "13_scale_out.py"}
 
 
+def test_make_targets_and_extras_that_pages_name_exist():
+    text = "\n".join(path.read_text() for path in PAGES)
+    targets = set(re.findall(r"^ {4}make ([a-z-]+)", text, re.MULTILINE))
+    assert {"demo", "test", "lab"} <= targets
+    rules = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert targets <= set(rules)
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    named = [name.split(",") for name in re.findall(r"pip install .*\.\[([a-z,]+)\]", text)]
+    assert named and set().union(*named) <= extras["optional-dependencies"].keys()
+
+
+@pytest.mark.slow
+def test_the_readmes_line_starts_jupyterlab_for_root_too(tmp_path):
+    (line,) = re.findall(r"^ {4}\.venv/bin/(jupyter lab [^#\n]*)", README, re.MULTILINE)
+    program = [sys.executable, "-m", *line.split(), "--no-browser", "--ServerApp.port=0"]
+    folders = {f"JUPYTER_{kind}_DIR": str(tmp_path) for kind in ("CONFIG", "DATA", "RUNTIME")}
+    with subprocess.Popen(
+        program, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=os.environ | folders
+    ) as server:
+        assert server.stderr is not None
+        said = []
+        for words in server.stderr:
+            said.append(words)
+            if "http://127.0.0.1:" in words:
+                break
+        server.terminate()
+    assert "http://127.0.0.1:" in said[-1], "".join(said)
+
+
 @pytest.mark.slow
 def test_the_example_in_the_readme_drives_to_its_goal(capsys):
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     exec(example, {})
     route, *_, episode = capsys.readouterr().out.splitlines()
     assert route.startswith("Route(") and episode.startswith("Episode(reached")
