@@ -144,9 +144,8 @@ def grade(
 
 def _nothing(paths: Sequence[Path], skipped: Mapping[Path, str]) -> str:
     """Say that there is no notebook, and what there is instead."""
-    where = ", ".join(map(plain_name, paths)) or "no path"
-    there = "; ".join(_skips(skipped)) or "it is empty"
-    return f"no notebook in {where} ({there}): name one, or a folder of them"
+    there = "; ".join([*map(plain_name, paths), *_skips(skipped)]) or "nothing was named"
+    return f"no notebook to grade ({there}): name one, or a folder of them"
 
 
 def _skips(skipped: Mapping[Path, str]) -> list[str]:
