@@ -11,7 +11,7 @@ import numpy as np
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.fusion import fuse
-from fgtutor.planning import Planner, plan
+from fgtutor.planning import Backend, Planner, plan
 
 POLICIES = 4
 
@@ -35,7 +35,7 @@ def row(cells: int) -> str:
     start, goal = grid.centre_of(0, 0), grid.centre_of(cells - 1, cells - 1)
     tree = Planner(fused=fused, policy_map=policy_map, grid=grid).towards(goal)
 
-    def route(backend: str, **settings: Any) -> Callable[[], object]:
+    def route(backend: Backend, **settings: Any) -> Callable[[], object]:
         settings |= {"grid": grid, "start": start, "goal": goal, "tensors": tensors}
         return lambda: plan(fused, policy_map, backend=backend, **settings)
 

@@ -25,6 +25,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, PlanningError
 from fgtutor.fusion import fuse
 from fgtutor.pipeline import plan_on_map
+from fgtutor.planning import Cost
 from fgtutor.routes import Route
 from fgtutor.specialist import GENERAL, Specialist
 from fgtutor.tensorization import Assessment, Taus, assess_all, resolve_taus, steps_on_known
@@ -284,7 +285,7 @@ def find_route(
     *,
     f_min: float = 0.1,
     switch_cost: float = 0.0,
-    cost: str = "inverse",
+    cost: Cost = "inverse",
 ) -> Route:
     """Return the planner's cheapest route; its `names` are the policies that may drive it.
 
