@@ -232,6 +232,7 @@ def read(folder: Path, content: str | bytes) -> tuple[str, list[str], str]:
         ('{"nbformat": 3, "worksheets": [{"cells": []}]}', "nbformat 3 .* open and save it in Jup"),
         ('{"worksheets": []}', "nbformat 3 .* open and save it in Jupyter"),
         ('{"nbformat": 2, "cells": []}', "nbformat 3 or older"),
+        ('{"cells": [0' + ", 0" * 10_000 + "]}", "more than 10000 cells"),
     ],
 )
 def test_what_is_no_notebook_of_today_is_named_as_such(tmp_path, content, complaint):

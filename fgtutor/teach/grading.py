@@ -226,7 +226,7 @@ def run(config: GradeConfig) -> int:
         print("\n".join(map(str, marks)))
         print(f"{KEY}; {len(marks)} notebooks, seed {config.seed}, {config.cases} cases")
         if config.gradescope:
-            print(f'{config.gradescope} has {len(learners)} results under "learners".')
+            print(f'{plain_name(config.gradescope)} has {len(learners)} results under "learners".')
     if config.learner == "path" and (both := [name for name in learners if "/" in name]):
         print(
             f"{len(both)} learners, such as {both[0]}, are told apart by folder and file name: use "
@@ -249,7 +249,9 @@ def _check_outputs(config: GradeConfig, notebooks: Sequence[Path]) -> None:
     real = [os.path.realpath(path) for path in (*files, *notebooks)]
     for path in files:
         if real.count(os.path.realpath(path)) > 1:
-            raise ConfigError(f"{path} is to be written, but is a notebook or another output")
+            raise ConfigError(
+                f"{plain_name(path)} is to be written, but is a notebook or another output"
+            )
         check_writable(path)
     if config.reports:
         make_folder(config.reports)

@@ -22,6 +22,8 @@ Rule = Literal["path", "file", "folder", "one"]
 """What names a learner; see `learners_of`."""
 LARGEST_NOTEBOOK = 20_000_000
 """Bytes; an exercise without outputs has ten thousand."""
+MOST_CELLS = 10_000
+"""An exercise has thirty."""
 LARGEST_CODE = 1_000_000
 """Characters in all code cells; a solution has five thousand."""
 UNREADABLE = "cannot be read"
@@ -65,7 +67,7 @@ def find_notebooks(paths: Sequence[Path]) -> tuple[list[Path], dict[Path, str]]:
     skipped: dict[Path, str] = {}
     for path in paths:
         if not os.path.lexists(path):
-            raise ConfigError(f"{path} is no notebook and no folder: check the path")
+            raise ConfigError(f"{plain_name(path)} is no notebook and no folder: check the path")
         if not os.path.isdir(path):
             inside = [path]
         elif path.is_symlink() and len(paths) > 1:
@@ -224,6 +226,8 @@ def read_submission(path: Path) -> Content:
         )
     if not isinstance(notebook.get("cells"), list):
         raise NotebookError("not a readable notebook: it has no list of cells")
+    if len(notebook["cells"]) > MOST_CELLS:
+        raise NotebookError(f"more than {MOST_CELLS} cells: hand in less")
     damage = [] if version == 4 else [f"its nbformat is {_brief(version)} instead of 4"]
     metadata = notebook.get("metadata")
     if not isinstance(metadata, dict):
