@@ -5,6 +5,7 @@ about its numbers is obeyed, or the file is refused; so it is if it says what is
 """
 
 import hashlib
+import mmap
 import stat
 import struct
 import zipfile
@@ -182,7 +183,12 @@ def _load_png(path: Path) -> dict[str, Any]:
 @decoding
 def _picture(path: Path) -> tuple[np.ndarray, int | None]:
     """Return the values of a grey picture, and which of them is transparent."""
-    with Image.open(path, formats=["PNG"]) as image:
+    # Mapped, since a file takes memory for whatever length a chunk claims before it reads it.
+    with (
+        path.open("rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+        Image.open(data, formats=["PNG"]) as image,  # pyright: ignore[reportArgumentType]
+    ):
         check_cells(image.size)  # a second header may say otherwise
         if image.mode not in ("L", "I", "I;16", "I;16B") or getattr(image, "is_animated", False):
             raise MapError(f"it must hold one picture in grey, this one is {image.mode}")

@@ -312,6 +312,7 @@ class Trainer:
         self.saved, self.easiest = self.iteration, state["easiest"]
         self._renew(dict(own["env"]))
         self.history = state["history"]
+        self.specialist()  # raises where none could be made of it at the end
         torch.set_rng_state(own["torch_random"])
 
     def specialist(self) -> Specialist:

@@ -5,6 +5,7 @@ import math
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 import zlib
 from pathlib import Path
@@ -116,3 +117,18 @@ def test_an_honest_large_map_loads(tmp_path: Path, suffix: str) -> None:
     said, megabytes = loaded_elsewhere(path)
     assert "7000 x 7100 cells of 0.05 m from (500000.0, 4649776.0), heights 0.00..1.00 m" in said
     assert megabytes < 1000
+
+
+def test_a_chunk_that_claims_two_gigabytes_takes_none(tmp_path: Path) -> None:
+    path = tmp_path / "m.png"
+    Image.fromarray(np.arange(30, dtype=np.uint16).reshape(5, 6)).save(path)
+    content = path.read_bytes()
+    at = content.index(b"IDAT") - 4
+    path.write_bytes(content[:at] + b"\x80" + content[at + 1 :])
+    notes = {"scale": 1.0, "offset": 0.0, "resolution": 0.1, "origin": [0.0, 0.0]}
+    path.with_name(path.name + ".yaml").write_text(yaml.safe_dump(notes))
+    tracemalloc.start()
+    ElevationMap.load(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10**8
