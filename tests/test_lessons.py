@@ -9,12 +9,13 @@ import torch
 from matplotlib.image import AxesImage
 
 from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError
 from fgtutor.execution import FollowConfig, execute
 from fgtutor.patches import PatchGrid
 from fgtutor.planning import as_networkx
 from fgtutor.ppo import feasibility_labels
 from fgtutor.robots.toy import ToyEnv
-from fgtutor.teach import charts, lessons
+from fgtutor.teach import a1_lessons, canvas, charts, figures, lessons, notebooks, videos
 from fgtutor.terrain import World, make_terrain
 
 GRID = PatchGrid(ahead=0.4, behind=0.2, half_width=0.2)
@@ -180,3 +181,31 @@ def test_the_live_curve_draws_at_once_then_now_and_then(monkeypatch):
     assert len(shown) == 1  # the first row at once, the next after 1000 s
     live.draw(live.rows[:2])
     assert len(shown) == 2 and len(live.rows) == 3
+
+
+# Numbers ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("function", "places", "name"),
+    [
+        (lessons.patch_gallery, 3, "columns"),
+        (lessons.compare_routes, 2, "columns"),
+        (lessons.collect, 2, "seconds"),
+        (charts.draw_labels, 3, "dt"),
+        (figures.draw_petals, 2, "every"),
+        (canvas.save_figure, 2, "dpi"),
+        (a1_lessons.show_walk, 3, "count"),
+        (a1_lessons.show_walk, 3, "columns"),
+        (a1_lessons.walk_sticks, 1, "count"),
+        (a1_lessons.draw_gait, 1, "dt"),
+        (videos.film_strip, 3, "count"),
+        (videos.film_strip, 3, "columns"),
+        (notebooks.budget, 2, "each"),
+    ],
+)
+@pytest.mark.parametrize("number", [-1, math.nan, math.inf, "3"])
+def test_a_number_without_sense_is_refused_before_anything_is_drawn(function, places, name, number):
+    others = [1] * places if function is notebooks.budget else [None] * places
+    with pytest.raises(ConfigError, match=f"^{name}: "):
+        function(*others, **{name: number})

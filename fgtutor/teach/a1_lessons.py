@@ -28,11 +28,12 @@ from fgtutor.robots.offscreen import Renderer, Shot
 from fgtutor.routes import Route
 from fgtutor.specialist import Specialist
 from fgtutor.teach.a1_film import BESIDE, DISTANCE, VIEW
-from fgtutor.teach.canvas import TITLE, Picture
+from fgtutor.teach.canvas import TITLE, Panels, Picture
 from fgtutor.teach.charts import INK, LINES, colours_of
 from fgtutor.teach.figures import GROUND
 from fgtutor.teach.videos import film_strip
 from fgtutor.terrain import Terrain
+from fgtutor.validation import Positive, check_arguments
 
 LEG_COLOURS = dict(zip(LEGS, LINES, strict=False))
 """Each leg has one colour in the stick figures and in the gait."""
@@ -110,9 +111,10 @@ def _draw_legs(axes, across: Float[np.ndarray, "4 4"], up: Float[np.ndarray, "4 
 
 
 def show_walk(
-    episode: Episode, terrain: Terrain, route: Route, *, count: int = 6, columns: int = 3
+    episode: Episode, terrain: Terrain, route: Route, *, count: Panels = 6, columns: Panels = 3
 ) -> Image.Image | Picture:
     """Return a film strip of a walk; where nothing draws MuJoCo's scenes, stick figures of it."""
+    check_arguments(show_walk, locals(), ConfigError)
     try:
         strip = film_strip(episode, terrain, route, count=count, columns=columns)
     except RenderingError:
@@ -122,8 +124,9 @@ def show_walk(
     return strip
 
 
-def walk_sticks(episode: Episode, *, count: int = 4) -> Picture:
+def walk_sticks(episode: Episode, *, count: Panels = 4) -> Picture:
     """Draw stick figures at `count` moments of a recorded walk, evenly spread."""
+    check_arguments(walk_sticks, locals(), ConfigError)
     if episode.body is None:
         raise ConfigError("this episode has no body recorded: drive it with execute()")
     steps = np.linspace(0, len(episode.poses) - 1, count).astype(int).tolist()
@@ -185,8 +188,9 @@ class A1View:
 # What it feels and is paid for --------------------------------------------------------------------
 
 
-def draw_gait(loads: ArrayLike, dt: float) -> Picture:
+def draw_gait(loads: ArrayLike, dt: Positive) -> Picture:
     """Draw which foot stands when, from the ground's forces on the four feet, [time, 4] in N."""
+    check_arguments(draw_gait, locals(), ConfigError)
     loaded = np.asarray(loads) > LOADED
     figure = Picture(7.0, 2.0)
     axes = figure.subplots()

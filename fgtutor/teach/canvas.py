@@ -7,12 +7,15 @@ Nothing here touches pyplot, whose figures are global state.
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
+from annotated_types import Interval
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from fgtutor.errors import ConfigError
 from fgtutor.storage import atomic_write
+from fgtutor.validation import check_arguments
 
 POLICY_COLOURS = {
     "steps": "#0072B2",
@@ -28,6 +31,10 @@ OTHER_COLOURS = ("#882255", "#999933", "#332288", "#F0E442")
 """Policies that the course does not know take these in turn: Paul Tol's muted ones and a yellow."""
 TITLE = {"fontsize": 10.5, "weight": "bold", "ha": "left"}
 """How titles look."""
+Panels = Annotated[int, Interval(ge=1, le=1000)]
+"""A number of pictures, in all or side by side."""
+Dpi = Annotated[float, Interval(ge=1, le=2400)]
+"""Dots per inch."""
 
 
 class Picture(Figure):
@@ -43,13 +50,14 @@ class Picture(Figure):
         return buffer.getvalue()
 
 
-def save_figure(figure: Figure, path: str | Path, dpi: float = 120) -> Path:
+def save_figure(figure: Figure, path: str | Path, dpi: Dpi = 120) -> Path:
     """Write a figure whole or not at all; the suffix chooses the format (.png, .svg, .pdf ...).
 
     Raises:
-        ConfigError: The suffix is no picture format.
+        ConfigError: The suffix is no picture format, or `dpi` no number of dots.
         StorageError: The system refused to write.
     """
+    check_arguments(save_figure, locals(), ConfigError)
     path = Path(path)
     formats = figure.canvas.get_supported_filetypes()
     if path.suffix[1:].lower() not in formats:

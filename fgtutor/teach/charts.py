@@ -16,11 +16,13 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from fgtutor.errors import ConfigError
 from fgtutor.evaluation.metrics import wilson_interval
 from fgtutor.feasibility import ood_weight
 from fgtutor.teach.canvas import POLICY_COLOURS, TITLE, Picture
 from fgtutor.teach.figures import training_curve
 from fgtutor.terrain import Terrain
+from fgtutor.validation import Positive, check_arguments
 
 if TYPE_CHECKING:
     from fgtutor.execution import Episode
@@ -184,11 +186,12 @@ def draw_labels(
     tracking: Float[Tensor, "time 3"],
     labels: Float[Tensor, " time"],
     valid: Bool[Tensor, " time"],
-    dt: float,
+    dt: Positive,
 ) -> Picture:
     """Draw one robot's r_v over time and the labels made of it; grey where there is no label."""
     figure = Picture(7.0, 3.2)
     axes = figure.subplots()
+    check_arguments(draw_labels, locals(), ConfigError)
     t = np.arange(len(labels)) * dt
     r_v, failed, ended = np.asarray(tracking).T
     usable = np.asarray(valid)

@@ -28,6 +28,7 @@ from fgtutor import directions
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.teach.canvas import POLICY_COLOURS, TITLE, Picture, policy_colours, save_figure
+from fgtutor.validation import Count, check_arguments
 
 if TYPE_CHECKING:
     from fgtutor.pipeline import Plan
@@ -152,7 +153,7 @@ def draw_petals(
     names: Sequence[str] = (),
     *,
     f_min: float = 0.1,
-    every: int | None = None,
+    every: Count | None = None,
     axes: Axes | None = None,
 ) -> Figure:
     """Draw a tensor F [nx, ny, 8] as one flower a cell: a petal's length is F along its heading.
@@ -160,6 +161,7 @@ def draw_petals(
     With `policy_map` and `names` petals have the colour of the best policy, else of their heading.
     `every` draws every n-th cell along x and y, by default as few as can be told apart.
     """
+    check_arguments(draw_petals, locals(), ConfigError)
     axes = _stage(grid, axes)
     tensor = _fit("F", fused, grid)
     every = every or max(1, -(-max(grid.shape) // GLYPHS))

@@ -30,13 +30,15 @@ from tqdm import tqdm
 
 from fgtutor import directions, patches
 from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError
 from fgtutor.patches import PatchGrid, sample_patches
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.routes import Route
-from fgtutor.teach.canvas import TITLE, Picture, policy_colours
+from fgtutor.teach.canvas import TITLE, Panels, Picture, policy_colours
 from fgtutor.teach.charts import INK
 from fgtutor.teach.figures import GROUND, draw_elevation, draw_route
 from fgtutor.terrain import Terrain
+from fgtutor.validation import Positive, check_arguments
 
 if TYPE_CHECKING:
     from fgtutor.execution import Episode
@@ -74,7 +76,7 @@ def patch_gallery(
     grid: PatchGrid,
     captions: Sequence[str],
     *,
-    columns: int = 4,
+    columns: Panels = 4,
     title: str = "",
     unit: str = "height (m)",
 ) -> Picture:
@@ -82,6 +84,7 @@ def patch_gallery(
 
     Whatever has one number a point may be shown so, such as the weights of a network's first layer.
     """
+    check_arguments(patch_gallery, locals(), ConfigError)
     rows = -(-len(shown) // columns)
     x, y = _span(grid)
     figure = Picture(7.2, 0.45 + rows * (0.35 + 6.2 / columns * (y[1] - y[0]) / (x[1] - x[0])))
@@ -195,9 +198,10 @@ def straight_route(terrain: Terrain, name: str) -> Route:
 
 
 def collect(
-    env: LocomotionEnv, act: Callable[[TensorDict], Tensor], seconds: float
+    env: LocomotionEnv, act: Callable[[TensorDict], Tensor], seconds: Positive
 ) -> dict[str, Float[Tensor, "time envs _"]]:
     """Let the robots of `env` act for a while; return every observation group over time."""
+    check_arguments(collect, locals(), ConfigError)
     steps = round(seconds / env.control_dt)
     observations = [env.get_observations()]
     for _ in tqdm(range(steps - 1), unit="step"):
@@ -253,9 +257,10 @@ def draw_graph(
 
 
 def compare_routes(
-    elevation: ElevationMap, routes: Mapping[str, Route | str], *, columns: int = 2
+    elevation: ElevationMap, routes: Mapping[str, Route | str], *, columns: Panels = 2
 ) -> Picture:
     """Draw routes over one map side by side; where there is none, give the reason as a text."""
+    check_arguments(compare_routes, locals(), ConfigError)
     rows = -(-len(routes) // columns)
     width = 7.6 / columns
     figure = Picture(7.6, rows * (width * elevation.size[1] / elevation.size[0] + 0.6) + 0.4)

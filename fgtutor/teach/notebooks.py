@@ -27,7 +27,7 @@ from fgtutor.progress import waiting
 from fgtutor.robots import ROBOTS
 from fgtutor.specialist import DESCRIPTION, ZOO
 from fgtutor.storage import atomic_write, make_folder
-from fgtutor.validation import check_fields
+from fgtutor.validation import Count, NonNegative, check_arguments, check_fields
 
 if TYPE_CHECKING:
     from nbformat import NotebookNode
@@ -45,7 +45,7 @@ BAR = re.compile(r".*\d+/\d+ \[.*\]")
 WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
-def budget(fast: int, full: int, *, unit: str = "rounds", each: float = 0.0) -> int:
+def budget(fast: Count, full: Count, *, unit: str = "rounds", each: NonNegative = 0.0) -> int:
     """Return how much a long cell should do, and say it: `fast` if FGTUTOR_FAST is 1, else `full`.
 
     Args:
@@ -54,6 +54,7 @@ def budget(fast: int, full: int, *, unit: str = "rounds", each: float = 0.0) -> 
         unit: What is counted, for the message.
         each: Seconds that one of them takes on two CPU cores; 0 leaves the time out.
     """
+    check_arguments(budget, locals(), ConfigError)
     in_force, other = (fast, full) if os.environ.get(FAST) == "1" else (full, fast)
     how = "in full" if in_force == full else "fast"
     switch = f"without {FAST}=1" if in_force == fast else f"with {FAST}=1"

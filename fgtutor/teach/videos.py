@@ -26,8 +26,10 @@ from fgtutor.robots.toy import CLIFF, ToyModel
 from fgtutor.routes import Route
 from fgtutor.storage import atomic_write
 from fgtutor.teach.a1_film import A1Film
+from fgtutor.teach.canvas import Panels
 from fgtutor.teach.films import FPS, INK, SKY, WIDTH, EpisodeFilm, MapView, font
 from fgtutor.terrain import Terrain
+from fgtutor.validation import Positive, check_arguments
 
 SIDE = (WIDTH, 272)
 """Size of the toy's side view, pixels."""
@@ -150,9 +152,10 @@ def film_of(episode: Episode, terrain: Terrain, route: Route) -> EpisodeFilm:
 
 
 def frames(
-    episode: Episode, terrain: Terrain, route: Route, *, fps: float = FPS
+    episode: Episode, terrain: Terrain, route: Route, *, fps: Positive = FPS
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Yield the frames of an episode, one every 1 / fps seconds, the last one held."""
+    check_arguments(frames, locals(), ConfigError)
     image = np.zeros(0, dtype=np.uint8)
     film = film_of(episode, terrain, route)
     for picture in film.frames(film.times(fps)):
@@ -185,9 +188,10 @@ def save_video(
 
 
 def film_strip(
-    episode: Episode, terrain: Terrain, route: Route, *, count: int = 8, columns: int = 2
+    episode: Episode, terrain: Terrain, route: Route, *, count: Panels = 8, columns: Panels = 2
 ) -> Image.Image:
     """Return views at `count` moments, evenly spread from start to end, read row by row."""
+    check_arguments(film_strip, locals(), ConfigError)
     film = film_of(episode, terrain, route)
     steps = np.linspace(0, len(episode.poses) - 1, count).astype(int).tolist()
     views = [view.resize((2 * view.width // 3, 2 * view.height // 3), Image.Resampling.LANCZOS)
