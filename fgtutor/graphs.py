@@ -21,6 +21,9 @@ READABLE_STEP, EDGE, STATE = 700, 14, 64
 index, a weight and its check; a node of its heap, a distance and the next state). Measured."""
 STRIP_CELLS = 1 << 13
 """Cells whose edges are listed at a time."""
+_ORDER = np.argsort(directions.STEPS @ (-(1 << 20), -1))
+"""Headings by the cell they come from: scipy keeps the edges that enter a cell in that order."""
+_RANKS = np.argsort(_ORDER)
 CURE = "plan on a part of the map (ElevationMap.crop), on coarser cells, or with switch_cost=0"
 
 
@@ -160,10 +163,10 @@ def _changes(
 
 
 def _entering(leaving: np.ndarray) -> np.ndarray:
-    """Move what is said of the step that leaves a cell along k to the cell where it ends."""
+    """Move what is said of the step that leaves a cell to where it ends, in the order of tails."""
     moved = np.zeros_like(leaving)
     for heading, tail, head in steps_of(leaving.shape[:2]):
-        moved[(*head, heading)] = leaving[(*tail, heading)]
+        moved[(*head, _RANKS[heading])] = leaving[(*tail, heading)]
     return moved
 
 
@@ -179,25 +182,26 @@ def _edges_into(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """List the edges that end in a strip of one layer: their number up to each state, tail, weight.
 
-    `cells` are the first cell of the strip and the number of all cells.
+    `cells` are the first cell of the strip and the number of all cells. Steps stand in the order
+    of `_entering`.
     """
     first, layer = cells
-    ny = feasibility.shape[1]
-    steps = -(directions.STEPS @ (ny, 1))  # from where a step ends to where it started
-    # One slot for each edge that a state can have: is it there, its tail, its heading, its extra.
-    there = [feasibility > 0]
-    slots = [(new * layer + steps, np.arange(8), np.zeros(8))]
+    steps = -(directions.STEPS[_ORDER] @ (feasibility.shape[1], 1))  # from its end to its start
+    # A ninth kind of edge stays in the cell and costs nothing but the change.
+    costs = np.zeros((feasibility[..., 0].size, 9))
+    with np.errstate(divide="ignore"):  # a step that is not there has F = 0, and is not taken
+        costs[:, :8] = step_cost(feasibility, _ORDER, cost, resolution).reshape(-1, 8)
+    # One slot for each edge that a state can have: is it there, its tail, its kind, its extra.
+    there, offset = [feasibility > 0], [new * layer + steps]
     for old, inside, along in changes:
         there += [along, inside[..., None]]
-        slots.append((old * layer + steps, np.arange(8), np.full(8, switch_cost)))
-        slots.append((np.array([old * layer]), np.array([8]), np.array([switch_cost])))
-    offset, heading, extra = (np.concatenate(parts) for parts in zip(*slots, strict=True))
-    order = np.argsort(offset)  # scipy keeps the columns of a row in order
-    mask = np.concatenate(there, axis=-1).reshape(-1, len(order))[:, order]
-    cell, slot = np.nonzero(mask)
-    slot = order[slot]
-    # The ninth heading stays in the cell: F is infinite, so that 1 / F is no cost.
-    stay = np.pad(feasibility.reshape(-1, 8), ((0, 0), (0, 1)), constant_values=np.inf)
-    heading = heading[slot]
-    weight = step_cost(stay[cell, heading], heading % 8, cost, resolution) + extra[slot]
-    return mask.sum(axis=1).cumsum(), first + cell + offset[slot], weight
+        offset.append(old * layer + np.append(steps, 0))
+    offset = np.concatenate(offset)
+    kind = np.append(np.arange(8), np.tile(np.arange(9), len(changes)))
+    extra = np.where(np.arange(len(kind)) < 8, 0.0, switch_cost)
+    mask = np.concatenate(there, axis=-1).reshape(-1, len(kind))
+    count = np.count_nonzero(mask, axis=1)
+    cell = np.repeat(np.arange(len(mask)), count)
+    slot = np.flatnonzero(mask) - cell * len(kind)
+    weight = costs.ravel()[cell * 9 + kind[slot]] + extra[slot]
+    return count.cumsum(), cell + (first + offset)[slot], weight

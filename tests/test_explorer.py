@@ -189,7 +189,7 @@ def test_what_goes_wrong_is_said_not_raised():
     grid, said = random_world(1)
     explorer = Explorer(grid, said, *corners(grid))
     explorer.update(goal=(99.0, 99.0))
-    assert explorer.route is None and "the goal (99, 99) m is off the map" in explorer.status
+    assert explorer.route is None and "the goal (99.00, 99.00) m is off the map" in explorer.status
     explorer.update(goal=grid.centre_of(*np.argwhere(~grid.known)[0].tolist()))
     assert "never observed" in explorer.status
     explorer.update(policies=())
