@@ -296,6 +296,25 @@ def test_a_file_that_goes_away_is_a_fault_of_nobody(tmp_path, capsys):
     assert second.points == 6
 
 
+@pytest.mark.slow
+def test_a_mistake_of_ours_names_the_file_and_stops_nobody_else(tmp_path, monkeypatch, capsys):
+    ask = grading.ask_submission
+
+    def clumsy(cells, *rest):
+        if cells == ["boom"]:
+            raise RuntimeError("our mistake")
+        return ask(cells, *rest)
+
+    monkeypatch.setattr(grading, "ask_submission", clumsy)
+    submit(tmp_path, "ex10_unlucky", "boom")
+    submit(tmp_path, "ex10_lucky", *HONEST)
+    assert grading.run(GradeConfig(paths=(tmp_path,), **QUICK)) == 1
+    lucky, unlucky, *_ = capsys.readouterr().out.splitlines()
+    assert "6 of 6" in lucky
+    assert "a mistake of fgtutor" in unlucky and "our mistake" in unlucky
+    assert unlucky.endswith("ex10_unlucky.ipynb]")
+
+
 @pytest.mark.parametrize(
     ("fields", "complaint"),
     [
