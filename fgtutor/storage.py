@@ -31,6 +31,7 @@ _ADVICE = {
     errno.EROFS: "the file system is read-only: choose another folder",
     errno.ENOENT: "create the folder first",
     errno.ENOTDIR: "a part of the path is a file, not a folder: choose another path",
+    errno.EEXIST: "there is a file of this name: choose another path",
     errno.EISDIR: "the path is a folder: give the name of a file in it",
     errno.EINVAL: "give the name of a file",
     errno.ENAMETOOLONG: "choose a shorter name",
