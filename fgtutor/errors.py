@@ -74,7 +74,7 @@ class NotebookError(FgtutorError):
 
 
 class GradingError(FgtutorError):
-    """A submission could not be run, by no fault of its own: the machine is busy, or has no room."""
+    """A submission could not be run, by no fault of its own: the machine is busy or has no room."""
 
 
 class CloudError(FgtutorError):
