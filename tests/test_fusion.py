@@ -54,6 +54,7 @@ def test_tensors_on_their_way_through_a_training_are_fused_as_numbers():
         ([np.zeros((0, 3, 8))], "tensor 0 has shape"),
         ([np.float64(0.5)], "tensor 0 has shape"),
         ([constant(0.5).astype(complex)], "tensor 0 holds complex128"),
+        ([np.ma.masked_greater(constant(0.5), 0.4)], "tensor 0 has masked values"),
         ([constant(0.5).astype(str)], "tensor 0 holds <U"),
     ],
 )
