@@ -58,18 +58,17 @@ def damage_bytes(rng: random.Random, data: bytes, other: bytes) -> bytes:
     """Flip a bit, cut, insert, remove, splice, blank, repeat, or overwrite a number."""
     at, count = place(rng, len(data)), rng.choice((1, 1, 2, 4, 8, 100, 1000))
     begin, middle, end = data[:at], data[at : at + count], data[at + count :]
-    return rng.choice(
-        (
-            begin + bytes(b ^ 1 << rng.randrange(8) for b in middle[:1]) + data[at + 1 :],
-            rng.choice((begin, data[:-count])),
-            begin + rng.randbytes(count) + data[at:],
-            begin + end,
-            begin + other[place(rng, len(other)) :],
-            begin + rng.choice((b"\0", b"\xff")) * count + end,
-            begin + middle * 2 + end,
-            poke(rng, data, at, rng.choice((1, 2, 4, 8))),
-        )
+    ways: tuple[Callable[[], bytes], ...] = (
+        lambda: begin + bytes(b ^ 1 << rng.randrange(8) for b in middle[:1]) + data[at + 1 :],
+        lambda: rng.choice((begin, data[:-count])),
+        lambda: begin + rng.randbytes(count) + data[at:],
+        lambda: begin + end,
+        lambda: begin + other[place(rng, len(other)) :],
+        lambda: begin + rng.choice((b"\0", b"\xff")) * count + end,
+        lambda: begin + middle * 2 + end,
+        lambda: poke(rng, data, at, rng.choice((1, 2, 4, 8))),
     )
+    return rng.choice(ways)()
 
 
 def damage_text(rng: random.Random, data: bytes, other: bytes) -> bytes:

@@ -1,5 +1,6 @@
 """The fuzzer's specialists, routes, shards, notebooks and checkpoints, and what is right."""
 
+import copy
 import hashlib
 import io
 import json
@@ -9,7 +10,7 @@ import struct
 import tempfile
 import warnings
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -273,9 +274,8 @@ def use_checkpoint(folder: Path) -> None:
     run = trainer()
     run.config = replace(run.config, out=folder)
     run.resume()
-    specialist = run.specialist()
-    assert all(torch.isfinite(p).all() for p in specialist.policy.parameters())
-    assert repr(specialist) and 0 <= run.iteration < 10**9
+    assert all(torch.isfinite(p).all() for p in run.algorithm.get_policy().parameters())
+    assert 0 <= run.iteration < 10**9
 
 
 def behind_checksum(change: Damage) -> Damage:
@@ -283,13 +283,20 @@ def behind_checksum(change: Damage) -> Damage:
     return lambda rng, data, other: data[:DIGEST] + change(rng, data[DIGEST:], other[DIGEST:])
 
 
+@lru_cache(4)
+def parsed(data: bytes) -> Any:
+    import torch
+
+    with warnings.catch_warnings(action="ignore"):
+        return torch.load(io.BytesIO(data), weights_only=True)
+
+
 def damage_state(rng: random.Random, data: bytes, other: bytes) -> bytes:
     """Replace or remove a value of the state, and write it as torch does."""
     import torch
 
     try:
-        with warnings.catch_warnings(action="ignore"):
-            state = torch.load(io.BytesIO(data), weights_only=True)
+        state = copy.deepcopy(parsed(data))
     except Exception:  # damaged before
         return damage_bytes(rng, data, other)
     spots = places(state)

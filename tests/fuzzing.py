@@ -21,7 +21,7 @@ import tempfile
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -133,7 +133,7 @@ def _judge_refusal(error: FgtutorError) -> Outcome:
     return "refused", kind, text
 
 
-def _child(connection: Any, target: Target, cases: dict[int, Case], work: Path) -> None:
+def _child(connection: Any, target: Target, cases: Iterator[Case], work: Path) -> None:
     """Load cases one after the other and send each outcome; what they print goes to a file."""
     os.chdir(work)
     output = os.open("output", os.O_RDWR | os.O_CREAT | os.O_APPEND)
@@ -142,7 +142,7 @@ def _child(connection: Any, target: Target, cases: dict[int, Case], work: Path) 
     used = re.search(r"VmData:\s+(\d+) kB", Path("/proc/self/status").read_text())
     resource.setrlimit(resource.RLIMIT_DATA, (int(used[1]) * 1024 + MEMORY,) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    for case in cases.values():
+    for case in cases:
         shutil.rmtree("case", ignore_errors=True)
         folder = work / "case"
         folder.mkdir()
@@ -169,13 +169,11 @@ def fuzz(
     judge(target, Path("nowhere"))  # imports what the loader imports late
     number, end = first, first + cases
     while number < end:
-        batch = {
-            i: make_case(name, target, seeds, seed, i)
-            for i in range(number, min(number + BATCH, end))
-        }
+        batch = range(number, min(number + BATCH, end))
+        made = (make_case(name, target, seeds, seed, i) for i in batch)
         with tempfile.TemporaryDirectory(dir=shared, ignore_cleanup_errors=True) as work:
             ours, theirs = context.Pipe(duplex=False)
-            child = context.Process(target=_child, args=(theirs, target, batch, Path(work)))
+            child = context.Process(target=_child, args=(theirs, target, made, Path(work)))
             child.start()
             theirs.close()
             alive = True
@@ -192,7 +190,7 @@ def fuzz(
                 if outcome[0] == "fault" and len(tally.faults[outcome[1]]) <= 3:
                     folder = keep / f"{name}-{seed}-{number}"
                     folder.mkdir(parents=True, exist_ok=True)
-                    for file, content in batch[number].items():
+                    for file, content in make_case(name, target, seeds, seed, number).items():
                         (folder / file).write_bytes(content)
                 number += 1
             if not alive:
