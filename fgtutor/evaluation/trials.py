@@ -12,7 +12,7 @@ from fgtutor.baselines import Planner, View, find_route
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import PlanningError
 from fgtutor.execution import FollowConfig, execute_batch
-from fgtutor.planning import Route
+from fgtutor.planning import Cost, Route
 from fgtutor.specialist import Specialist
 from fgtutor.tensorization import Taus
 from fgtutor.terrain import Terrain
@@ -62,7 +62,7 @@ def drive(
     taus: Taus = "calibrated",
     f_min: float = 0.1,
     switch_cost: float = 0.0,
-    cost: str = "inverse",
+    cost: Cost = "inverse",
     follow: FollowConfig | None = None,
 ) -> list[Trial]:
     """Plan over every ground with every planner, and drive the routes; planner by planner.
