@@ -12,8 +12,8 @@ import time
 
 import torch
 
-from fgtutor.recipe import A1TrainConfig, make_training_env
-from fgtutor.robots.a1 import A1Env
+from fgtutor.learning.config import A1TrainConfig, make_training_env
+from fgtutor.robots.a1.env import A1Env
 from fgtutor.specialist import ZOO, load_specialist
 
 

@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from fgtutor.teach.grading import GradeConfig, grade
+from fgtutor.course.grading.grade import GradeConfig, grade
 
 LOOP = "def spl(success, length, reference):\n    while True: pass"
 

@@ -11,9 +11,9 @@ import time
 
 import torch
 
-from fgtutor.robots import a1_model
-from fgtutor.robots.physics import Physics
-from fgtutor.terrain import World, make_terrain
+from fgtutor.robots.a1 import model as a1_model
+from fgtutor.robots.a1.physics import Physics
+from fgtutor.world.terrain import World, make_terrain
 
 SUBSTEPS = 4
 

@@ -8,8 +8,8 @@ import time
 import numpy as np
 
 from fgtutor.robots.lidar import LidarConfig, scan_terrain, survey
-from fgtutor.scanning import map_points
-from fgtutor.terrain import make_terrain
+from fgtutor.world.scanning import map_points
+from fgtutor.world.terrain import make_terrain
 
 AREA = (40.0, 25.0)
 """Size of the synthetic clouds, m."""

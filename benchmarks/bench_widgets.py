@@ -13,11 +13,11 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from fgtutor.demo import GOAL, MAP, START
+from fgtutor.cli.demo import GOAL, MAP, START
+from fgtutor.course.widgets.explorer import Explorer
+from fgtutor.course.widgets.tau_views import TauView
 from fgtutor.elevation import ElevationMap
 from fgtutor.specialist import load_zoo
-from fgtutor.teach.explorer import Explorer
-from fgtutor.teach.tau_views import TauView
 from fgtutor.tensorization import Assessment
 
 CELLS = 128

@@ -14,7 +14,7 @@ import numpy as np
 
 import fgtutor
 from fgtutor.elevation import ElevationMap
-from fgtutor.terrain import SCALES, make_terrain
+from fgtutor.world.terrain import SCALES, make_terrain
 
 RESOLUTION = 0.1
 WALL = 0.45  # m; more than twice the highest riser, less than what counts as a hole below it

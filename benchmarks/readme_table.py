@@ -17,7 +17,7 @@ from typing import Any
 
 from fgtutor.errors import ReportError
 from fgtutor.evaluation.report import ROWS, RUN, TABLE, markdown
-from fgtutor.storage import atomic_write
+from fgtutor.io.storage import atomic_write
 
 PAGES = (Path("README.md"), Path("docs/results.md"))
 FREE = {"policies", "planners", "zoo"}

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from fgtutor.elevation import ElevationMap
     from fgtutor.execution import execute
     from fgtutor.fusion import fuse
+    from fgtutor.learning.training import train
     from fgtutor.planning import plan
     from fgtutor.specialist import Specialist, load_specialist, load_zoo
     from fgtutor.tensorization import assess, tensorize
-    from fgtutor.terrain import Terrain, make_terrain
-    from fgtutor.training import train
+    from fgtutor.world.terrain import Terrain, make_terrain
 
 __version__ = "0.1.0"
 
@@ -51,16 +51,16 @@ __all__ = [
 _HOMES = {
     "ElevationMap": "elevation",
     "Specialist": "specialist",
-    "Terrain": "terrain",
+    "Terrain": "world.terrain",
     "assess": "tensorization",
     "execute": "execution",
     "fuse": "fusion",
     "load_specialist": "specialist",
     "load_zoo": "specialist",
-    "make_terrain": "terrain",
+    "make_terrain": "world.terrain",
     "plan": "planning",
     "tensorize": "tensorization",
-    "train": "training",
+    "train": "learning.training",
 }
 
 

@@ -17,14 +17,14 @@ from fgtutor import __version__
 from fgtutor.errors import FgtutorError
 
 COMMANDS = {
-    "demo": ("demo", "DemoConfig", "plan over a mixed terrain and drive it"),
-    "train": ("training", "config_of", "train a specialist with its Feasibility-Net"),
+    "demo": ("cli.demo", "DemoConfig", "plan over a mixed terrain and drive it"),
+    "train": ("learning.training", "config_of", "train a specialist with its Feasibility-Net"),
     "sweep": (
         "evaluation.sweep",
         "config_of",
         "train many specialists side by side, and compare them",
     ),
-    "plan": ("pipeline", "PlanConfig", "plan a route over a map file"),
+    "plan": ("cli.plan", "PlanConfig", "plan a route over a map file"),
     "evaluate matrix": (
         "evaluation.matrix",
         "MatrixConfig",
@@ -55,12 +55,20 @@ COMMANDS = {
         "NewcomerConfig",
         "say what one more specialist adds, and that it changes no other",
     ),
-    "map": ("mapping", "MapConfig", "turn a point cloud into an elevation map"),
-    "export": ("export", "ExportConfig", "write a policy as ONNX, with what it observes"),
-    "notebooks": ("teach.notebooks", "NotebooksConfig", "execute the course's notebooks"),
-    "exercises": ("teach.courseware", "ExercisesConfig", "build the exercises from their masters"),
-    "grade": ("teach.grading", "GradeConfig", "grade one exercise notebook or a whole class"),
-    "doctor": ("doctor", "DoctorConfig", "say what this machine has, lacks and needs"),
+    "map": ("cli.map", "MapConfig", "turn a point cloud into an elevation map"),
+    "export": ("cli.export", "ExportConfig", "write a policy as ONNX, with what it observes"),
+    "notebooks": ("course.notebooks", "NotebooksConfig", "execute the course's notebooks"),
+    "exercises": (
+        "course.exercises",
+        "ExercisesConfig",
+        "build the exercises from their masters",
+    ),
+    "grade": (
+        "course.grading.grade",
+        "GradeConfig",
+        "grade one exercise notebook or a whole class",
+    ),
+    "doctor": ("cli.doctor", "DoctorConfig", "say what this machine has, lacks and needs"),
 }
 """Command: module under fgtutor, its config dataclass (or what picks it), what it is for."""
 
@@ -108,8 +116,8 @@ def _run(command: str, options: Sequence[str]) -> int:
     """Import a command's module, let tyro fill its dataclass, and run it."""
     module_name, config_name, _ = COMMANDS[command]
     try:
-        from fgtutor.progress import waiting  # here: `fgtutor --help` needs none of it
-        from fgtutor.validation import parse_options
+        from fgtutor.io.progress import waiting  # here: `fgtutor --help` needs none of it
+        from fgtutor.io.validation import parse_options
 
         with waiting(f"fgtutor {command}: loading") if sys.stderr.isatty() else nullcontext():
             module = importlib.import_module(f"fgtutor.{module_name}")

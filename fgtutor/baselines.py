@@ -24,12 +24,12 @@ from fgtutor.directions import NUM_HEADINGS
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, PlanningError
 from fgtutor.fusion import fuse
+from fgtutor.io.validation import Count, Positive, check_fields
 from fgtutor.pipeline import plan_on_map
 from fgtutor.planning import Cost
 from fgtutor.routes import Route
 from fgtutor.specialist import GENERAL, Specialist
 from fgtutor.tensorization import Assessment, Taus, assess_all, resolve_taus, steps_on_known
-from fgtutor.validation import Count, Positive, check_fields
 
 Radius = Annotated[float, Interval(ge=0, le=10)]
 """How far something reaches, m."""

@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from fgtutor import mapfiles
 from fgtutor.errors import MapError, OffMapError
 from fgtutor.grid import cells_of, check_cells, coordinate_text, point_text
-from fgtutor.validation import NonNegative, check_arguments, check_fields
+from fgtutor.io import maps
+from fgtutor.io.validation import NonNegative, check_arguments, check_fields
 
 Resolution = Annotated[float, Interval(ge=1e-3, le=1e6)]
 """Side of a cell, m. Less than a millimetre is no metre: degrees, in all likelihood."""
@@ -321,7 +321,7 @@ class ElevationMap:
             MapError: The suffix is none of these.
             StorageError: The system refused to write; nothing partial is left.
         """
-        mapfiles.write(self, Path(path))
+        maps.write(self, Path(path))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -334,7 +334,7 @@ class ElevationMap:
                 says something of its numbers that cannot be obeyed (degrees, several bands).
         """
         path = Path(path)
-        fields = mapfiles.read(path)
+        fields = maps.read(path)
         try:
             return cls(**fields)
         except MapError as error:

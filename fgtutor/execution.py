@@ -19,13 +19,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from fgtutor.errors import ConfigError
+from fgtutor.io.validation import Count, Unbounded, check_fields
 from fgtutor.planning import Route
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.robots.commands import LOOKAHEAD
 from fgtutor.specialist import Specialist
-from fgtutor.terrain import Terrain, World
-from fgtutor.validation import Count, Unbounded, check_fields
+from fgtutor.world.terrain import Terrain, World
 
 LONGEST = 100_000.0
 """The longest route that is driven, m."""

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from fgtutor.errors import ThresholdError
-from fgtutor.validation import Width
+from fgtutor.io.validation import Width
 
 HeightScale = Annotated[float, Interval(gt=0, le=1000)]
 """Units of height per metre."""

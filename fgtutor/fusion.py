@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fgtutor.directions import NUM_HEADINGS
 from fgtutor.errors import PlanningError
-from fgtutor.validation import numbers
+from fgtutor.io.validation import numbers
 
 Array = TypeVar("Array", Tensor, np.ndarray)
 

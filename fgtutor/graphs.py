@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from fgtutor import directions
-from fgtutor.machine import require_memory
+from fgtutor.io.machine import require_memory
 
 READABLE_STEP, EDGE, STATE = 700, 14, 64
 """Bytes that a search needs: per step of a networkx graph, per edge and per state of scipy's (an

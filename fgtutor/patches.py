@@ -18,7 +18,7 @@ from torch import Tensor
 from fgtutor.elevation import ElevationMap, Resolution
 from fgtutor.errors import ConfigError
 from fgtutor.grid import point_text
-from fgtutor.validation import check_arguments, check_fields
+from fgtutor.io.validation import check_arguments, check_fields
 
 HOLE_DEPTH = 0.3
 """Depth at which a hole counts as bottomless, m: deeper cells look alike to a patch."""

@@ -45,9 +45,9 @@ from fgtutor.graphs import (
     steps_of,
 )
 from fgtutor.grid import coordinate_text, point_text
-from fgtutor.machine import require_memory
+from fgtutor.io.machine import require_memory
+from fgtutor.io.validation import NonNegative, Positive, check_fields, numbers
 from fgtutor.routes import Route
-from fgtutor.validation import NonNegative, Positive, check_fields, numbers
 
 __all__ = ["Planner", "Route", "as_networkx", "as_switching_networkx", "plan"]
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from fgtutor import directions
 from fgtutor.errors import PlanningError
-from fgtutor.validation import parse_record
+from fgtutor.io.validation import parse_record
 
 LARGEST = 1e12
 """The largest number in a route; sums of larger ones lose their metres, or overflow."""

@@ -27,8 +27,16 @@ from torch import Tensor, nn
 
 from fgtutor.errors import FgtutorError, SpecialistError
 from fgtutor.feasibility import FeasibilityNet
+from fgtutor.io.storage import atomic_write, storage_error
+from fgtutor.io.validation import (
+    NAME,
+    Name,
+    check_fields,
+    parse_record,
+)
 from fgtutor.patches import PatchGrid
-from fgtutor.policies import PolicyConfig
+from fgtutor.policies.description import PolicyConfig
+from fgtutor.policies.symmetry import SymmetricMLP
 from fgtutor.specialist_folder import (
     CURE,
     DESCRIPTION,
@@ -45,14 +53,6 @@ from fgtutor.specialist_folder import (
     sizes_of,
 )
 from fgtutor.specialist_folder import checksum as _checksum
-from fgtutor.storage import atomic_write, storage_error
-from fgtutor.symmetry import SymmetricMLP
-from fgtutor.validation import (
-    NAME,
-    Name,
-    check_fields,
-    parse_record,
-)
 
 ZOO = Path(__file__).parent / "zoo"
 """The shipped specialists: one folder <robot>/<name> each."""

@@ -22,9 +22,9 @@ from torch import Tensor, nn
 
 from fgtutor.errors import SpecialistError
 from fgtutor.feasibility import FeasibilityNet
+from fgtutor.io.validation import LARGEST_RECORD, CountOrZero, Name, arguments, parse_record
 from fgtutor.patches import PatchGrid
-from fgtutor.policies import PolicyConfig
-from fgtutor.validation import LARGEST_RECORD, CountOrZero, Name, arguments, parse_record
+from fgtutor.policies.description import PolicyConfig
 
 SCHEMA = 1
 """Version of `specialist.json`; a reader refuses any other."""

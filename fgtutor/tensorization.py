@@ -31,8 +31,8 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, ThresholdError
 from fgtutor.feasibility import TAU_HIGH, TAU_LOW, calibrated_taus, ood_weight
 from fgtutor.grid import point_text
-from fgtutor.machine import require_memory
-from fgtutor.progress import watch
+from fgtutor.io.machine import require_memory
+from fgtutor.io.progress import watch
 
 if TYPE_CHECKING:
     from fgtutor.specialist import Specialist

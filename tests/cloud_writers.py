@@ -10,7 +10,7 @@ import lzf
 import numpy as np
 from laspy.vlrs.vlr import VLR
 
-from fgtutor.cloudfiles import save_points
+from fgtutor.io.clouds import save_points
 
 Writer = Callable[[Path, np.ndarray], object]
 

@@ -22,7 +22,7 @@ from fgtutor.feasibility import FeasibilityNet
 from fgtutor.patches import PatchGrid
 from fgtutor.robots.toy import ToyEnv
 from fgtutor.specialist import Specialist, save_specialist
-from fgtutor.terrain import World, make_terrain
+from fgtutor.world.terrain import World, make_terrain
 
 # Two cores are shared with whatever else runs; small networks are fastest on one thread anyway.
 torch.set_num_threads(1)

@@ -22,8 +22,9 @@ _SERVER = """
 import json, os, resource, signal, sys, traceback
 import torch, tyro
 from torch.utils.tensorboard import SummaryWriter
-import fgtutor.training, fgtutor.evaluation.sweep, fgtutor.evaluation.matrix, fgtutor.mapping
-import fgtutor.teach.grading, fgtutor.export, fgtutor.pipeline, fgtutor.robots.toy
+import fgtutor.learning.training, fgtutor.evaluation.sweep, fgtutor.evaluation.matrix
+import fgtutor.cli.map
+import fgtutor.course.grading.grade, fgtutor.cli.export, fgtutor.cli.plan, fgtutor.robots.toy
 from fgtutor import __main__ as cli
 torch.set_num_threads(1)
 for line in sys.stdin:

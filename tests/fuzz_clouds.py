@@ -14,8 +14,8 @@ POINTS = np.random.default_rng(0).random((40, 3)) * (2.0, 1.5, 0.3)
 
 
 def use_cloud(folder: Path) -> None:
-    from fgtutor.cloudfiles import read_points
-    from fgtutor.scanning import map_points
+    from fgtutor.io.clouds import read_points
+    from fgtutor.world.scanning import map_points
 
     (path,) = list(folder.glob("*")) or [folder / "cloud.ply"]
     points = read_points(path)

@@ -38,11 +38,11 @@ def specialists() -> list[Case]:
     from rsl_rl.modules.distribution import GaussianDistribution
     from tensordict import TensorDict
 
-    from fgtutor.dreamwaq import DreamWaQModel
     from fgtutor.feasibility import FeasibilityNet
     from fgtutor.patches import PatchGrid
+    from fgtutor.policies.dreamwaq import DreamWaQModel
+    from fgtutor.policies.symmetry import SymmetricMLPModel
     from fgtutor.specialist import Specialist, save_specialist
-    from fgtutor.symmetry import SymmetricMLPModel
 
     torch.manual_seed(0)
     grid = PatchGrid(ahead=0.3, behind=0.2, half_width=0.2)
@@ -189,8 +189,8 @@ def shards() -> list[Case]:
 
 
 def use_shard(folder: Path) -> None:
-    from fgtutor.evaluation.runner import Task
     from fgtutor.evaluation.shards import RunConfig, finished
+    from fgtutor.evaluation.tasks import Task
 
     for path in folder.glob("t0.json"):
         (folder / "shards").mkdir()
@@ -220,7 +220,7 @@ def notebooks() -> list[Case]:
 
 
 def use_notebook(folder: Path) -> None:
-    from fgtutor.teach.submissions import exercise_of, read_submission
+    from fgtutor.course.grading.submissions import exercise_of, read_submission
 
     path = folder / "ex06_ada.ipynb"
     content = read_submission(path)
@@ -237,8 +237,8 @@ def trainer() -> Any:
     """Return a training that has not begun; its folder changes from case to case."""
     import torch
 
-    from fgtutor.recipe import TrainConfig
-    from fgtutor.trainer import Trainer
+    from fgtutor.learning.config import TrainConfig
+    from fgtutor.learning.trainer import Trainer
 
     torch.set_num_threads(1)
     tiny: dict[str, Any] = {"num_envs": 2, "steps": 8, "rows": 1, "columns": 1, "hidden": (8, 4)}

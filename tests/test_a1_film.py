@@ -12,13 +12,13 @@ from PIL import Image
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, RenderingError
 from fgtutor.execution import Episode
-from fgtutor.robots.a1_model import STANCE, STANCE_HEIGHT
+from fgtutor.figures import videos
+from fgtutor.figures.a1_film import ABOVE, BESIDE, DISTANCE, TITLE, VIEW, A1Film, steepness
+from fgtutor.figures.canvas import POLICY_COLOURS
+from fgtutor.robots.a1.model import STANCE, STANCE_HEIGHT
 from fgtutor.robots.offscreen import Renderer
 from fgtutor.routes import Route
-from fgtutor.teach import videos
-from fgtutor.teach.a1_film import ABOVE, BESIDE, DISTANCE, TITLE, VIEW, A1Film, steepness
-from fgtutor.teach.canvas import POLICY_COLOURS
-from fgtutor.terrain import Terrain
+from fgtutor.world.terrain import Terrain
 
 NAMES = ("steps", "gaps")
 

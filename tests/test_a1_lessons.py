@@ -9,16 +9,16 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from fgtutor.baselines import View, find_route, ours
+from fgtutor.course import a1_lessons
+from fgtutor.course.lessons import straight_route
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, PlanningError, RenderingError
 from fgtutor.execution import Episode, FollowConfig
-from fgtutor.robots.a1 import A1_EPISODES, A1Env
-from fgtutor.robots.a1_model import LEGS, STANCE, STANCE_HEIGHT, build_spec
+from fgtutor.figures.a1_film import VIEW
+from fgtutor.robots.a1.env import A1_EPISODES, A1Env
+from fgtutor.robots.a1.model import LEGS, STANCE, STANCE_HEIGHT, build_spec
 from fgtutor.robots.offscreen import Renderer
-from fgtutor.teach import a1_lessons
-from fgtutor.teach.a1_film import VIEW
-from fgtutor.teach.lessons import straight_route
-from fgtutor.terrain import Terrain, World, make_terrain
+from fgtutor.world.terrain import Terrain, World, make_terrain
 
 SHORT = FollowConfig(patience=1.0, grace=1.0)
 

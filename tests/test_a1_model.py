@@ -6,8 +6,8 @@ import pytest
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.robots import a1_model
-from fgtutor.terrain import Box, make_terrain
+from fgtutor.robots.a1 import model as a1_model
+from fgtutor.world.terrain import Box, make_terrain
 
 SLICES = a1_model.sensor_slices()
 

@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import RenderingError
-from fgtutor.robots import a1_scene as scenes
-from fgtutor.robots.a1 import A1Env
-from fgtutor.robots.a1_model import JOINTS, STANCE
-from fgtutor.robots.a1_scene import a1_scene, ground_colour
+from fgtutor.robots.a1 import looks as scenes
+from fgtutor.robots.a1.env import A1Env
+from fgtutor.robots.a1.looks import a1_scene, ground_colour
+from fgtutor.robots.a1.model import JOINTS, STANCE
 from fgtutor.robots.offscreen import COAT, Renderer, Shot
-from fgtutor.terrain import Terrain, World, make_terrain
+from fgtutor.world.terrain import Terrain, World, make_terrain
 
 RED, BLUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 SIZE = {"width": 64, "height": 48}

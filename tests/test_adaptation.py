@@ -21,10 +21,10 @@ from fgtutor.evaluation.adaptation import (
     way_of,
 )
 from fgtutor.feasibility import FeasibilityNet
-from fgtutor.robots.a1 import A1_GRID
+from fgtutor.robots.a1.env import A1_GRID
 from fgtutor.robots.toy import TOY_GRID
 from fgtutor.specialist import ZOO, load_specialist, save_specialist
-from fgtutor.terrain import SCALES
+from fgtutor.world.terrain import SCALES
 
 GRIDS = {"toy": TOY_GRID, "a1": A1_GRID}
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fgtutor.teach.cells import Cells, compiled
+from fgtutor.course.grading.cells import Cells, compiled
 
 RIGHT = "def fuse(k):\n    return k + 1\n"
 

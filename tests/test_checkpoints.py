@@ -5,10 +5,10 @@ import math
 
 import pytest
 
-from fgtutor.checkpoints import read_checkpoint, write_checkpoint
 from fgtutor.errors import CheckpointError
-from fgtutor.recipe import TrainConfig
-from fgtutor.trainer import Trainer
+from fgtutor.learning.checkpoints import read_checkpoint, write_checkpoint
+from fgtutor.learning.config import TrainConfig
+from fgtutor.learning.trainer import Trainer
 
 
 @pytest.fixture

@@ -10,17 +10,17 @@ import pytest
 import torch
 
 from fgtutor import patches
+from fgtutor.course.checks import ex08, find
 from fgtutor.directions import STEPS, YAWS
 from fgtutor.elevation import ElevationMap
-from fgtutor.evaluation.metrics import calibration, spl, wilson_interval
 from fgtutor.feasibility import calibrated_taus, ood_weight
 from fgtutor.fusion import fuse
+from fgtutor.learning.ppo import feasibility_labels
 from fgtutor.planning import as_networkx, as_switching_networkx, plan
-from fgtutor.ppo import feasibility_labels
-from fgtutor.robots import a1_model
-from fgtutor.robots.a1_bodies import A1EnvConfig
+from fgtutor.robots.a1 import model as a1_model
+from fgtutor.robots.a1.randomise import A1EnvConfig
 from fgtutor.robots.commands import tracking_reward, turn_rate
-from fgtutor.teach.checks import ex08, find
+from fgtutor.statistics import calibration, spl, wilson_interval
 from fgtutor.tensorization import assess
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import fgtutor
 from fgtutor import __main__ as cli
-from fgtutor.doctor import DoctorConfig
+from fgtutor.cli.doctor import DoctorConfig
 from fgtutor.errors import MapError
 
 
@@ -84,7 +84,7 @@ def test_what_a_command_raises_becomes_a_message(capsys, monkeypatch, raised, co
     def run(config):
         raise raised
 
-    monkeypatch.setattr("fgtutor.doctor.run", run)
+    monkeypatch.setattr("fgtutor.cli.doctor.run", run)
     assert cli.main(["doctor"]) == code
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
@@ -92,13 +92,13 @@ def test_what_a_command_raises_becomes_a_message(capsys, monkeypatch, raised, co
 
 @pytest.mark.parametrize(("returned", "code"), [(None, 0), (0, 0), (1, 1)])
 def test_the_exit_code_is_what_the_command_returns(monkeypatch, returned, code):
-    monkeypatch.setattr("fgtutor.doctor.run", lambda config: returned)
+    monkeypatch.setattr("fgtutor.cli.doctor.run", lambda config: returned)
     assert cli.main(["doctor"]) == code
 
 
 def test_options_reach_the_dataclass(monkeypatch, tmp_path):
     seen = []
-    monkeypatch.setattr("fgtutor.doctor.run", seen.append)
+    monkeypatch.setattr("fgtutor.cli.doctor.run", seen.append)
     assert cli.main(["doctor", "--zoo", str(tmp_path), "--no-gl", "--gl-seconds", "5"]) == 0
     assert seen == [DoctorConfig(zoo=tmp_path, gl=False, gl_seconds=5.0)]
 

@@ -9,9 +9,9 @@ import pytest
 from cloud_writers import cloud, geokeys, las
 from rasterio.crs import CRS
 
-from fgtutor.cloudfiles import read_cloud, read_points
 from fgtutor.errors import CloudError
-from fgtutor.scanning import ScanConfig, map_points
+from fgtutor.io.clouds import read_cloud, read_points
+from fgtutor.world.scanning import ScanConfig, map_points
 
 FOOT, US_FOOT = 0.3048, 1200 / 3937
 UTM, LONG_ISLAND, NAVD88_FEET = 32631, 2263, 6360

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from cloud_writers import DOUBLES, SPARE, cloud, pcd, ply
 
-from fgtutor.cloudfiles import read_cloud, read_points
 from fgtutor.errors import CloudError
-from fgtutor.scanning import ScanConfig, map_points
+from fgtutor.io.clouds import read_cloud, read_points
+from fgtutor.world.scanning import ScanConfig, map_points
 
 POINTS = cloud(4)
 FACES = "element face 2\nproperty list uchar int vertex_indices"

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgtutor.cloudfiles import read_cloud, read_points
 from fgtutor.errors import CloudError
+from fgtutor.io.clouds import read_cloud, read_points
 
 EAST, NORTH, UP = 500000.5, 4649776.25, 100.125
 ONE = [[EAST, NORTH, UP]]

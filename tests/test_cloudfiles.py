@@ -12,10 +12,10 @@ from cloud_writers import FORMATS, cloud, las, pcd, written
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fgtutor.cloudfiles import read_cloud, read_points, save_points
-from fgtutor.clouds import cloud_of
 from fgtutor.errors import CloudError, StorageError
-from fgtutor.scanning import map_points
+from fgtutor.io.cloud import cloud_of
+from fgtutor.io.clouds import read_cloud, read_points, save_points
+from fgtutor.world.scanning import map_points
 
 COUNTED = [name for name in FORMATS if "xyz" not in name]
 """The formats that say how many points they hold, or notice a missing end."""

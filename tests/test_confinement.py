@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from fgtutor.teach import grading, sandbox
-from fgtutor.teach.confinement import landlock_version
-from fgtutor.teach.grading import GradeConfig, grade
-from fgtutor.teach.values import decode
+from fgtutor.course.grading import grade as grading
+from fgtutor.course.grading import sandbox
+from fgtutor.course.grading.confinement import landlock_version
+from fgtutor.course.grading.grade import GradeConfig, grade
+from fgtutor.course.grading.values import decode
 from tests.test_grading import HONEST, QUICK, submit
 from tests.test_sandbox import asked
 
@@ -74,7 +75,7 @@ def test_the_kernel_opens_no_answer_no_hand_in_and_no_secret(tmp_path, hook):
     (tmp_path / "link.py").symlink_to(CLONE / "solutions" / "src" / "ex10.py")
     closed = [
         *(CLONE / "solutions").rglob("ex10.*"),
-        *(CLONE / "fgtutor/teach/checks").glob("*.*"),
+        *(CLONE / "fgtutor/course/checks").glob("*.*"),
         *(CLONE / "fgtutor/evaluation").glob("metrics.py"),
         CLONE / "pyproject.toml",
         *tmp_path.iterdir(),
@@ -84,7 +85,7 @@ def test_the_kernel_opens_no_answer_no_hand_in_and_no_secret(tmp_path, hook):
         Path("/etc/shadow"),
     ]
     assert len(closed) > 25
-    folders = [CLONE, CLONE / "solutions", CLONE / "fgtutor/teach/checks", tmp_path, "/", "/proc"]
+    folders = [CLONE, CLONE / "solutions", CLONE / "fgtutor/course/checks", tmp_path, "/", "/proc"]
     opened, lists = [*map(str, closed), np_file()], [*map(str, folders)]
     replies = asked([OPEN, hook], tried=(opened,), listed=(lists,))
     (got,), (seen,) = (map(decode, replies[name]["answers"]) for name in ("tried", "listed"))
@@ -106,20 +107,20 @@ def np_file() -> str:
 @walled
 def test_our_package_is_closed_also_where_it_is_installed_among_others(tmp_path):
     packages = tmp_path / "lib" / "python3.11" / "site-packages"
-    for name in ("numpy/a.py", "fgtutor/teach/checks/ex01.py", "single.py"):
+    for name in ("numpy/a.py", "fgtutor/course/checks/ex01.py", "single.py"):
         (packages / name).parent.mkdir(parents=True, exist_ok=True)
         (packages / name).write_text(name)
     (packages / "other").symlink_to(packages / "fgtutor")
     (packages / "~gtutor").symlink_to(packages / "numpy")
     code = (
-        "import os, sys\nfrom fgtutor.teach import confinement as c\n"
+        "import os, sys\nfrom fgtutor.course import confinement as c\n"
         f"root, packages = {str(tmp_path / 'lib')!r}, {str(packages)!r}\n"
         "sys.path.append(packages)\n"
         "folders, closed = c.readable()\n"
         "assert packages in folders and packages + '/fgtutor' in closed\n"
         "assert c._prctl(38, 1) and c._wall_off_files([*folders, root], closed)\n"
-        "for name in ('numpy/a.py', 'single.py', 'fgtutor/teach/checks/ex01.py',\n"
-        "             'other/teach/checks/ex01.py'):\n"
+        "for name in ('numpy/a.py', 'single.py', 'fgtutor/course/checks/ex01.py',\n"
+        "             'other/course/checks/ex01.py'):\n"
         "    try: print(open(os.path.join(packages, name)).read())\n"
         "    except PermissionError: print('closed')\n"
         "print(len(os.listdir(packages)))\n"
@@ -159,13 +160,13 @@ def path_length(xy):
 """,
     "the course's checks": """
 import importlib, sys
-for name in ("fgtutor.teach.checks", "fgtutor.teach.checks.ex10"):
+for name in ("fgtutor.course.checks", "fgtutor.course.checks.ex10"):
     sys.modules.pop(name, None)
 sys.meta_path[:] = [finder for finder in sys.meta_path if type(finder).__name__ != "_Offered"]
 sys.path.append({clone!r})
 importlib.invalidate_caches()
 try:
-    import fgtutor.teach.checks.ex10 as answers
+    import fgtutor.course.checks.ex10 as answers
     path_length, spl, reference_length = [question.truth for question in answers.QUESTIONS]
 except Exception:
     pass
@@ -192,7 +193,7 @@ def test_no_thief_scores_or_reports_what_he_took(tmp_path):
 
 
 def test_without_landlock_the_hook_stands_and_the_grader_says_so(tmp_path, monkeypatch, capsys):
-    older = "import fgtutor.teach.confinement as c; c.landlock_version = lambda: 0; main()"
+    older = "import fgtutor.course.grading.confinement as c; c.landlock_version = lambda: 0; main()"
     monkeypatch.setattr(sandbox, "START", sandbox.START.replace("main()", older))
     cell = f"def path_length(xy): return open({str(CLONE / 'solutions/src/ex10.py')!r}).read()"
     path = submit(tmp_path, "ada", HONEST[0], cell, *HONEST[3:])

@@ -9,15 +9,15 @@ import pytest
 import torch
 from PIL import Image
 
-from fgtutor import demo
+from fgtutor.cli import demo
 from fgtutor.errors import RenderingError, SpecialistError, StorageError
 from fgtutor.feasibility import FeasibilityNet
-from fgtutor.robots.a1 import A1_GRID, A1Env
+from fgtutor.policies.symmetry import SymmetricMLPModel
+from fgtutor.robots.a1.env import A1_GRID, A1Env
 from fgtutor.robots.offscreen import Renderer
 from fgtutor.routes import Route
 from fgtutor.specialist import save_specialist
-from fgtutor.symmetry import SymmetricMLPModel
-from fgtutor.terrain import World, make_terrain
+from fgtutor.world.terrain import World, make_terrain
 
 BALL = '<mujoco><worldbody><geom size="0.1"/></worldbody></mujoco>'
 

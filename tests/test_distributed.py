@@ -5,10 +5,10 @@ import sys
 import pytest
 import torch
 
-from fgtutor import distributed
 from fgtutor.errors import CheckpointError
+from fgtutor.learning import distributed
+from fgtutor.learning.training import TrainConfig, Trainer
 from fgtutor.specialist import load_specialist
-from fgtutor.training import TrainConfig, Trainer
 
 TINY = {
     "num_envs": 4,
@@ -30,8 +30,8 @@ from pathlib import Path
 
 import torch
 
-from fgtutor import distributed
-from fgtutor.training import TrainConfig, Trainer
+from fgtutor.learning import distributed
+from fgtutor.learning.training import TrainConfig, Trainer
 
 def note(trainer, name):
     algorithm = trainer.algorithm

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from fgtutor import doctor
-from fgtutor.doctor import DoctorConfig, Finding
+from fgtutor.cli import doctor
+from fgtutor.cli.doctor import DoctorConfig, Finding
 from fgtutor.robots import GL_BACKENDS
 from fgtutor.specialist import save_specialist
 

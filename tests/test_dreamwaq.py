@@ -11,21 +11,21 @@ import tyro
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 
-from fgtutor.dreamwaq import HISTORY, ContextNet, DreamWaQModel, History, mirrors
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import CheckpointError, ConfigError, SpecialistError
 from fgtutor.execution import FollowConfig, execute
+from fgtutor.learning.config import A1TrainConfig, TrainConfig
+from fgtutor.learning.training import Trainer, train
 from fgtutor.planning import plan
-from fgtutor.recipe import A1TrainConfig, TrainConfig
+from fgtutor.policies.dreamwaq import HISTORY, ContextNet, DreamWaQModel, History, mirrors
+from fgtutor.policies.symmetry import Mirror
 from fgtutor.robots import ROBOTS, env_class
-from fgtutor.robots.a1 import A1Env, A1EnvConfig
-from fgtutor.robots.a1_model import MIRROR, MIRROR_SIGNS
+from fgtutor.robots.a1.env import A1Env, A1EnvConfig
+from fgtutor.robots.a1.model import MIRROR, MIRROR_SIGNS
 from fgtutor.robots.commands import EnvConfig
 from fgtutor.robots.toy import ToyEnv
 from fgtutor.specialist import load_specialist, save_specialist
-from fgtutor.symmetry import Mirror
-from fgtutor.terrain import Terrain, World, make_terrain
-from fgtutor.training import Trainer, train
+from fgtutor.world.terrain import Terrain, World, make_terrain
 
 robots = pytest.mark.parametrize("robot", sorted(ROBOTS))
 TINY = {

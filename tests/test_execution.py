@@ -11,7 +11,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.execution import FollowConfig, execute, execute_batch
 from fgtutor.planning import plan
-from fgtutor.terrain import Terrain, make_terrain
+from fgtutor.world.terrain import Terrain, make_terrain
 
 
 def straight(elevation, start, goal, policy=0):

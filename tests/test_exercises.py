@@ -8,13 +8,13 @@ import sys
 import numpy as np
 import pytest
 
+from fgtutor.course import checks, exercises
+from fgtutor.course.checks import EXERCISES, check, find, hint, questions_of, solution
+from fgtutor.course.checks.question import CRASHED, NOT_STARTED, PASSED, TOO_SLOW, WRONG, Judge
+from fgtutor.course.exercises import ExercisesConfig
+from fgtutor.course.grading.asking import ask
+from fgtutor.course.grading.grade import GradeConfig, grade
 from fgtutor.errors import ConfigError, NotebookError
-from fgtutor.teach import checks, courseware
-from fgtutor.teach.asking import ask
-from fgtutor.teach.checks import EXERCISES, check, find, hint, questions_of, solution
-from fgtutor.teach.checks.question import CRASHED, NOT_STARTED, PASSED, TOO_SLOW, WRONG, Judge
-from fgtutor.teach.courseware import ExercisesConfig
-from fgtutor.teach.grading import GradeConfig, grade
 
 QUESTIONS = [question for exercise in EXERCISES for question in questions_of(exercise)]
 BY_ID = pytest.mark.parametrize("question", QUESTIONS, ids=lambda question: question.id)
@@ -87,7 +87,7 @@ def test_a_number_to_find_is_not_told():
 
 def test_exercises_and_solutions_are_what_their_masters_give(root, capsys):
     config = ExercisesConfig(solutions=root / "solutions", exercises=root / "exercises", check=True)
-    assert courseware.run(config) == 0, capsys.readouterr().out
+    assert exercises.run(config) == 0, capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -109,7 +109,7 @@ def test_no_solution_is_left_in_an_exercise(root, exercise):
     text = (root / "exercises" / f"{exercise}.ipynb").read_text(encoding="utf-8")
     left = "\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"])
     master = (root / "solutions" / "src" / f"{exercise}.py").read_text(encoding="utf-8")
-    regions = [match["code"] for match in courseware.REGION.finditer(master)]
+    regions = [match["code"] for match in exercises.REGION.finditer(master)]
     assert len(regions) == len(questions_of(exercise))
     for line in itertools.chain.from_iterable(region.splitlines() for region in regions):
         # Shorter lines, such as `else:`, are nobody's secret.
@@ -156,7 +156,7 @@ reference_length = 2 * half
 def test_building_a_master_by_hand(tmp_path):
     master = tmp_path / "ex10.py"
     master.write_text(MASTER)
-    built = courseware.build(master)
+    built = exercises.build(master)
     stripped, solved = ([cell.source for cell in n.cells] for n in (built.exercise, built.solution))
     question = find("ex10.q1")
     assert stripped[0] == f"## ex10.q1 · {question.title} ({question.points} points)"
@@ -180,13 +180,13 @@ def test_a_broken_master_is_refused(tmp_path, old, new, complaint):
     master = tmp_path / "ex10.py"
     master.write_text(MASTER.replace(old, new, 1))
     with pytest.raises(NotebookError, match=complaint):
-        courseware.build(master)
+        exercises.build(master)
 
 
 def test_a_stale_exercise_is_noticed(root, tmp_path, capsys):
     config = ExercisesConfig(solutions=root / "solutions", exercises=tmp_path, check=True)
     (tmp_path / "ex01.ipynb").write_text("{}")
-    assert courseware.run(config) == 1
+    assert exercises.run(config) == 1
     assert "ex01.ipynb is not what its master gives" in capsys.readouterr().out
 
 
@@ -271,7 +271,7 @@ def test_an_unknown_question_lists_the_known_ones(name):
 
 def test_importing_the_checks_is_cheap():
     code = (
-        "import sys, fgtutor.teach.checks as c; c.check('ex06.q1', ...)\n"
+        "import sys, fgtutor.course.checks as c; c.check('ex06.q1', ...)\n"
         "print(sorted(sys.modules.keys() & {'torch', 'scipy', 'matplotlib', 'mujoco', 'IPython'}))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

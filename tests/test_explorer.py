@@ -11,15 +11,15 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from fgtutor import directions
+from fgtutor.course.widgets.explorer import Explorer
+from fgtutor.course.widgets.scene import Panel, Scene, on_picture, to_png, upright
+from fgtutor.course.widgets.tau_views import TAU_CHOICES, TauView, tau_figure
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, PlanningError, ThresholdError
+from fgtutor.figures import maps
 from fgtutor.fusion import fuse
 from fgtutor.planning import plan
 from fgtutor.routes import Route
-from fgtutor.teach import figures
-from fgtutor.teach.explorer import Explorer
-from fgtutor.teach.scene import Panel, Scene, on_picture, to_png, upright
-from fgtutor.teach.tau_views import TAU_CHOICES, TauView, tau_figure
 from fgtutor.tensorization import Assessment, assess, steps_on_known
 
 NAMES = ("steps", "gaps", "slopes")
@@ -273,17 +273,17 @@ def test_a_scene_has_the_figures_colours():
         drawn = np.asarray(figure.axes[0].images[0].get_array())[::-1] * 255
         np.testing.assert_allclose(scene.pictures[key][~unknown], drawn[~unknown], atol=2.1)
 
-    compare("M", figures.draw_elevation(grid))
-    compare("P", figures.draw_policy_map(explorer.policy_map, explorer.fused, grid, NAMES,
+    compare("M", maps.draw_elevation(grid))
+    compare("P", maps.draw_policy_map(explorer.policy_map, explorer.fused, grid, NAMES,
                                          f_min=0.95))  # fmt: skip
     for name in NAMES:
-        compare(f"w {name}", figures.draw_weight(explorer.weights[name], grid, name))
+        compare(f"w {name}", maps.draw_weight(explorer.weights[name], grid, name))
     for picture in scene.pictures.values():
         assert picture.shape == (7, 9, 3) and picture.dtype == np.uint8
-        assert np.abs(picture[unknown] / 255 - to_rgb(figures.UNKNOWN)).max() < 0.01
+        assert np.abs(picture[unknown] / 255 - to_rgb(maps.UNKNOWN)).max() < 0.01
     blocked = upright(explorer.fused.max(axis=-1) < 0.95) & ~unknown
     assert 0 < blocked.sum() < blocked.size
-    assert np.abs(scene.pictures["F"][blocked] / 255 - to_rgb(figures.BLOCKED)).max() < 0.01
+    assert np.abs(scene.pictures["F"][blocked] / 255 - to_rgb(maps.BLOCKED)).max() < 0.01
 
 
 def test_pictures_have_x_to_the_right_and_y_up():
@@ -304,8 +304,8 @@ def test_a_route_is_cut_where_the_policy_changes():
     explorer = Explorer(grid, said, (0.05, 0.05), (0.35, 0.05))
     scene = TauView(explorer).scene()
     assert list(scene.lines) == [
-        (figures.POLICY_COLOURS["steps"], [(0.5, 1.5), (1.5, 1.5), (2.5, 1.5)]),
-        (figures.POLICY_COLOURS["gaps"], [(2.5, 1.5), (3.5, 1.5)]),
+        (maps.POLICY_COLOURS["steps"], [(0.5, 1.5), (1.5, 1.5), (2.5, 1.5)]),
+        (maps.POLICY_COLOURS["gaps"], [(2.5, 1.5), (3.5, 1.5)]),
     ]
     assert scene.marks == {"start": (0.5, 1.5), "goal": (3.5, 1.5)}
     explorer.update(goal=explorer.settings.start)

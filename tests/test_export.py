@@ -13,14 +13,14 @@ from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 
-from fgtutor import export
-from fgtutor.dreamwaq import DreamWaQModel
+from fgtutor.cli import export
 from fgtutor.errors import ConfigError, ExportError, SpecialistError, StorageError
 from fgtutor.patches import prepare
-from fgtutor.robots.a1 import A1_GRID, A1Env
+from fgtutor.policies.dreamwaq import DreamWaQModel
+from fgtutor.policies.symmetry import SymmetricMLPModel
+from fgtutor.robots.a1.env import A1_GRID, A1Env
 from fgtutor.specialist import Specialist, save_specialist
-from fgtutor.symmetry import SymmetricMLPModel
-from fgtutor.terrain import World, make_terrain
+from fgtutor.world.terrain import World, make_terrain
 
 
 def walk(history: int = 0) -> A1Env:

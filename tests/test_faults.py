@@ -14,9 +14,9 @@ import pytest
 from faults import KILLED, Victim, contents, moments
 
 from fgtutor.elevation import ElevationMap
+from fgtutor.io.storage import LOCK
+from fgtutor.learning.trainer import read_checkpoint
 from fgtutor.specialist import load_specialist
-from fgtutor.storage import LOCK
-from fgtutor.trainer import read_checkpoint
 
 pytestmark = [
     pytest.mark.slow,

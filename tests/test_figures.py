@@ -18,13 +18,13 @@ from PIL import Image
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, StorageError
-from fgtutor.evaluation.metrics import calibration
 from fgtutor.execution import Episode
+from fgtutor.figures import maps, videos
 from fgtutor.fusion import fuse
 from fgtutor.pipeline import Plan
 from fgtutor.planning import plan
-from fgtutor.teach import figures, videos
-from fgtutor.terrain import Terrain
+from fgtutor.statistics import calibration
+from fgtutor.world.terrain import Terrain
 
 NAMES = ("steps", "gaps")
 START, GOAL = (0.25, 0.45), (3.75, 0.55)
@@ -89,7 +89,7 @@ def test_a_picture_shows_itself_without_pyplot():
     code = (
         "import sys, numpy as np\n"
         "from fgtutor.elevation import ElevationMap\n"
-        "from fgtutor.teach.figures import draw_elevation\n"
+        "from fgtutor.figures.maps import draw_elevation\n"
         "picture = draw_elevation(ElevationMap(np.eye(4)))\n"
         "print(picture._repr_png_()[:4] == b'\\x89PNG', 'matplotlib.pyplot' in sys.modules)"
     )
@@ -100,7 +100,7 @@ def test_a_picture_shows_itself_without_pyplot():
 def test_elevation_puts_x_to_the_right_and_y_up(ground):
     heights = np.zeros((4, 3))
     heights[3, 0] = 1.0  # x large, y small: the lower right corner
-    figure = figures.draw_elevation(ElevationMap(heights))
+    figure = maps.draw_elevation(ElevationMap(heights))
     image = figure.axes[0].images[0].get_array()
     assert image.shape == (3, 4, 3)
     darkest = np.unravel_index(image.sum(axis=-1).argmin(), (3, 4))
@@ -110,13 +110,13 @@ def test_elevation_puts_x_to_the_right_and_y_up(ground):
 
 def test_unknown_cells_are_hatched(ground):
     (hatched,) = (
-        c for c in figures.draw_elevation(ground).axes[0].collections if c.get_hatch() is not None
+        c for c in maps.draw_elevation(ground).axes[0].collections if c.get_hatch() is not None
     )
     corners = np.concatenate([path.vertices for path in hatched.get_paths()])
     assert corners.min(axis=0) == pytest.approx((0.5, 0.0))
     assert corners.max(axis=0) == pytest.approx((0.7, 0.1))
     known = ElevationMap(np.zeros((3, 3)))
-    assert not figures.draw_elevation(known).axes[0].collections
+    assert not maps.draw_elevation(known).axes[0].collections
 
 
 @given(
@@ -126,14 +126,14 @@ def test_unknown_cells_are_hatched(ground):
 )
 @settings(max_examples=5, deadline=None)
 def test_any_map_can_be_drawn(heights):
-    figure = figures.draw_elevation(ElevationMap(np.reshape(heights, (4, 3)), origin=(-5.0, 2.0)))
+    figure = maps.draw_elevation(ElevationMap(np.reshape(heights, (4, 3)), origin=(-5.0, 2.0)))
     assert pixels(figure).std() > 0
 
 
 def test_a_route_has_the_colours_of_its_policies(ground, planned):
-    figure = figures.draw_route(planned.route, ground)
+    figure = maps.draw_route(planned.route, ground)
     _, line = (c for c in figure.axes[0].collections if isinstance(c, LineCollection))
-    expected = [to_rgb(figures.POLICY_COLOURS[NAMES[p]]) for p in planned.route.policies]
+    expected = [to_rgb(maps.POLICY_COLOURS[NAMES[p]]) for p in planned.route.policies]
     np.testing.assert_allclose(line.get_colors()[:, :3], expected)
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["steps", "gaps", "start", "goal"]
@@ -141,22 +141,22 @@ def test_a_route_has_the_colours_of_its_policies(ground, planned):
 
 def test_a_route_of_one_cell_can_be_drawn(ground, planned):
     route = plan(planned.fused, planned.policy_map, grid=ground, start=START, goal=START)
-    assert pixels(figures.draw_route(route, ground)).std() > 0
+    assert pixels(maps.draw_route(route, ground)).std() > 0
 
 
 def test_strangers_keep_apart_from_the_known():
-    colours = figures.policy_colours(["ice", "steps", "sand"])
-    assert colours["steps"] == figures.POLICY_COLOURS["steps"]
-    assert len({*colours.values(), *figures.POLICY_COLOURS.values()}) == 9
+    colours = maps.policy_colours(["ice", "steps", "sand"])
+    assert colours["steps"] == maps.POLICY_COLOURS["steps"]
+    assert len({*colours.values(), *maps.POLICY_COLOURS.values()}) == 9
 
 
 @pytest.mark.parametrize("kind", [np.asarray, torch.tensor])
 def test_weight_is_white_where_a_policy_is_lost(ground, kind):
     w = np.zeros((40, 10, 8))
     w[7, 3] = 1.0
-    figure = figures.draw_weight(kind(w), ground, "gaps")
+    figure = maps.draw_weight(kind(w), ground, "gaps")
     image = figure.axes[0].images[0].get_array()
-    np.testing.assert_allclose(image[3, 7], to_rgb(figures.POLICY_COLOURS["gaps"]))
+    np.testing.assert_allclose(image[3, 7], to_rgb(maps.POLICY_COLOURS["gaps"]))
     np.testing.assert_allclose(image[3, 8], 1.0)
 
 
@@ -164,13 +164,13 @@ def test_a_petal_points_along_its_heading_and_is_as_long_as_f():
     grid = ElevationMap(np.zeros((3, 3)), resolution=1.0)
     f = np.zeros((3, 3, 8))
     f[1, 1, 2] = 0.5  # +y
-    figure = figures.draw_petals(f, grid, every=1)
+    figure = maps.draw_petals(f, grid, every=1)
     (petals,) = (c for c in figure.axes[0].collections if isinstance(c, PolyCollection))
     (petal,) = petals.get_paths()
     tip = petal.vertices[petal.vertices[:, 1].argmax()]
     # Centre (1.5, 1.5), and a petal of F = 1 reaches 0.56 cells far.
     assert tip == pytest.approx((1.5, 1.5 + 0.5 * 0.56))
-    np.testing.assert_allclose(petals.get_facecolor()[0, :3], to_rgb(figures.HEADING_COLOURS[2]))
+    np.testing.assert_allclose(petals.get_facecolor()[0, :3], to_rgb(maps.HEADING_COLOURS[2]))
 
 
 def test_petals_turn_with_the_map():
@@ -179,7 +179,7 @@ def test_petals_turn_with_the_map():
     turned = np.roll(np.rot90(f), 2, axis=-1)
 
     def points(tensor, elevation):
-        (petals,) = figures.draw_petals(tensor, elevation, every=1).axes[0].collections
+        (petals,) = maps.draw_petals(tensor, elevation, every=1).axes[0].collections
         return np.concatenate([path.vertices for path in petals.get_paths()])
 
     before, after = points(f, grid), points(turned, grid.rotated90())
@@ -189,39 +189,39 @@ def test_petals_turn_with_the_map():
 
 def test_a_large_map_gets_few_glyphs():
     grid = ElevationMap(np.zeros((200, 100)))
-    petals = figures.draw_petals(np.ones((200, 100, 8)), grid).axes[0].collections[0]
-    assert len(petals.get_paths()) <= 8 * figures.GLYPHS**2
+    petals = maps.draw_petals(np.ones((200, 100, 8)), grid).axes[0].collections[0]
+    assert len(petals.get_paths()) <= 8 * maps.GLYPHS**2
 
 
 def test_the_policy_map_shows_who_is_best_and_what_is_closed(ground, planned):
     fused = planned.fused.clone()
     fused[2, 4] = 0.05
-    figure = figures.draw_policy_map(planned.policy_map, fused, ground, NAMES)
+    figure = maps.draw_policy_map(planned.policy_map, fused, ground, NAMES)
     image = figure.axes[0].images[0].get_array()
-    np.testing.assert_allclose(image[4, 2], to_rgb(figures.BLOCKED))
+    np.testing.assert_allclose(image[4, 2], to_rgb(maps.BLOCKED))
     # F = 0.9 gives the strength 0.2 + 0.8 * 0.9 = 0.92 between white and the policy's colour.
     for ix, name in ((10, "steps"), (30, "gaps")):
-        colour = np.array(to_rgb(figures.POLICY_COLOURS[name]))
+        colour = np.array(to_rgb(maps.POLICY_COLOURS[name]))
         np.testing.assert_allclose(image[4, ix], 1 - 0.92 * (1 - colour))
 
 
 def test_the_plan_figure_has_every_panel(ground, planned, tmp_path):
     weights = {name: np.ones((40, 10, 8)) for name in NAMES}
-    figure = figures.plan_figure(ground, planned, weights)
+    figure = maps.plan_figure(ground, planned, weights)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert [t for t in titles if t and t[0] in "134"] and {"steps", "gaps"} <= set(titles)
-    path = figures.save_figure(figure, tmp_path / "plan.png", dpi=50)
+    path = maps.save_figure(figure, tmp_path / "plan.png", dpi=50)
     with Image.open(path) as image:
         assert image.width > 500
     with pytest.raises(ConfigError, match="gaps"):
-        figures.plan_figure(ground, planned, {"steps": weights["steps"]})
+        maps.plan_figure(ground, planned, {"steps": weights["steps"]})
 
 
 def test_figures_draw_in_threads(ground, planned):
     drawn = []
     threads = [
         threading.Thread(
-            target=lambda: drawn.append(pixels(figures.draw_route(planned.route, ground)))
+            target=lambda: drawn.append(pixels(maps.draw_route(planned.route, ground)))
         )
         for _ in range(3)
     ]
@@ -236,15 +236,15 @@ def test_figures_draw_in_threads(ground, planned):
 @pytest.mark.parametrize("count", [1, 20])
 def test_the_training_curve_draws_what_it_is_given(count):
     rows = [{"samples": 100.0 * i, "r_v": i / 20, "row": 1.0} for i in range(count)]
-    curves = [line for axes in figures.training_curve(rows).axes for line in axes.lines]
+    curves = [line for axes in maps.training_curve(rows).axes for line in axes.lines]
     assert [len(line.get_xdata()) for line in curves] == [count, count]
     with pytest.raises(ConfigError, match="at least one row"):
-        figures.training_curve([])
+        maps.training_curve([])
 
 
 def test_the_calibration_plot_skips_empty_bins():
     table, error = calibration(np.array([0.05, 0.06, 0.95]), np.array([0.1, 0.0, 0.9]))
-    figure = figures.calibration_plot(table, error)
+    figure = maps.calibration_plot(table, error)
     _, dots = figure.axes[0].lines
     np.testing.assert_allclose(dots.get_xydata(), [(0.055, 0.05), (0.95, 0.9)])
     assert f"{error:.3f}" in figure.axes[0].get_title(loc="left")
@@ -253,10 +253,10 @@ def test_the_calibration_plot_skips_empty_bins():
 @pytest.mark.parametrize(
     ("draw", "message"),
     [
-        (lambda grid: figures.draw_weight(np.ones((10, 40, 8)), grid), r"\(10, 40, 8\)"),
-        (lambda grid: figures.draw_petals(np.ones((40, 10)), grid), r"\(40, 10\)"),
+        (lambda grid: maps.draw_weight(np.ones((10, 40, 8)), grid), r"\(10, 40, 8\)"),
+        (lambda grid: maps.draw_petals(np.ones((40, 10)), grid), r"\(40, 10\)"),
         (
-            lambda grid: figures.draw_policy_map(
+            lambda grid: maps.draw_policy_map(
                 np.full((40, 10, 8), 3), np.ones((40, 10, 8)), grid, NAMES
             ),
             "up to 3, names has 2",
@@ -296,7 +296,7 @@ def test_the_side_view_shows_the_robot_in_its_policys_colour(episode, terrain, p
         image = np.asarray(film.side(t)).astype(float)
         # The chassis' centre lies above s = 0, at the camera's height: z = 0.3 everywhere.
         u, v = round(videos.BEHIND * videos.SCALE), round(0.5 * videos.SIDE[1])
-        colour = 255 * np.array(to_rgb(figures.POLICY_COLOURS[name]))
+        colour = 255 * np.array(to_rgb(maps.POLICY_COLOURS[name]))
         assert np.abs(image[v, u] - colour).max() < 2
 
 
@@ -356,7 +356,7 @@ def test_an_episode_of_one_step_is_a_film(episode, terrain, planned):
 @pytest.mark.parametrize("name", ["plan.docx", "plan"])
 def test_an_unknown_suffix_is_refused(ground, tmp_path, name):
     with pytest.raises(ConfigError, match="png"):
-        figures.save_figure(figures.draw_elevation(ground), tmp_path / name)
+        maps.save_figure(maps.draw_elevation(ground), tmp_path / name)
 
 
 def test_a_video_of_another_format_is_refused(episode, terrain, planned, tmp_path):
@@ -375,7 +375,7 @@ def test_a_full_disk_leaves_nothing(
     path = tmp_path / f"picture.{suffix}"
     with pytest.raises(StorageError, match="free some disk space"):
         if suffix == "png":
-            figures.save_figure(figures.draw_elevation(ground), path)
+            maps.save_figure(maps.draw_elevation(ground), path)
         else:
             videos.save_video(episode, terrain, planned.route, path)
     assert not list(tmp_path.iterdir())

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from fgtutor.teach import confinement
-from fgtutor.teach.checks import find
-from fgtutor.teach.checks.question import CRASHED, NOT_STARTED, PASSED, TOO_SLOW, WRONG
-from fgtutor.teach.grading import GradeConfig, grade
-from fgtutor.teach.marks import report
+from fgtutor.course.checks import find
+from fgtutor.course.checks.question import CRASHED, NOT_STARTED, PASSED, TOO_SLOW, WRONG
+from fgtutor.course.grading import confinement
+from fgtutor.course.grading.grade import GradeConfig, grade
+from fgtutor.course.grading.marks import report
 
 Q1, Q3 = "ex10.q1", "ex10.q3"
 HONEST = (
-    "import numpy as np\nfrom fgtutor.teach.checks import check, hint, solution",
+    "import numpy as np\nfrom fgtutor.course.checks import check, hint, solution",
     "def path_length(xy):\n    return np.linalg.norm(np.diff(xy, axis=0), axis=-1).sum()",
     'check("ex10.q1", path_length)',
     "def spl(success, length, reference):\n"
@@ -228,14 +228,14 @@ spl = {"outcome": "passed"}
 reference_length = float("nan")
 """,
     "peek": """
-import fgtutor.teach.checks.ex10 as answers
+import fgtutor.course.checks.ex10 as answers
 def path_length(xy): return answers.QUESTIONS[0].truth(xy)
 def spl(*values):
-    import fgtutor.evaluation.metrics
-    return fgtutor.evaluation.metrics.spl(*values)
+    import fgtutor.statistics
+    return fgtutor.statistics.spl(*values)
 import sys
 for path in sys.path:
-    try: exec(open(path + "/fgtutor/teach/checks/ex10.py").read())
+    try: exec(open(path + "/fgtutor/course/checks/ex10.py").read())
     except OSError: pass
 reference_length = globals().get("LENGTHS")
 """,
@@ -308,7 +308,7 @@ def test_the_kernel_itself_refuses(tmp_path, action):
     """Without the audit hook, which an attacker in the same process may get around."""
     (tmp_path / "old.txt").write_text("kept")
     code = (
-        "import os\nfrom fgtutor.teach.confinement import _filter_system_calls, _prctl\n"
+        "import os\nfrom fgtutor.course.grading.confinement import _filter_system_calls, _prctl\n"
         "assert _prctl(38, 1) and _filter_system_calls()\n"
         f"try:\n    {action}\nexcept (OSError, RuntimeError, ValueError) as error:\n"
         "    print(getattr(error, 'errno', None) or 1, open('old.txt').read(), 6 * 7)\n"

@@ -8,15 +8,16 @@ import pytest
 import torch
 from matplotlib.image import AxesImage
 
+from fgtutor.course import a1_lessons, lessons, notebooks
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.execution import FollowConfig, execute
+from fgtutor.figures import canvas, charts, maps, videos
+from fgtutor.learning.ppo import feasibility_labels
 from fgtutor.patches import PatchGrid
 from fgtutor.planning import as_networkx
-from fgtutor.ppo import feasibility_labels
 from fgtutor.robots.toy import ToyEnv
-from fgtutor.teach import a1_lessons, canvas, charts, figures, lessons, notebooks, videos
-from fgtutor.terrain import World, make_terrain
+from fgtutor.world.terrain import World, make_terrain
 
 GRID = PatchGrid(ahead=0.4, behind=0.2, half_width=0.2)
 SHORT = FollowConfig(patience=1.0, grace=1.0)
@@ -193,7 +194,7 @@ def test_the_live_curve_draws_at_once_then_now_and_then(monkeypatch):
         (lessons.compare_routes, 2, "columns"),
         (lessons.collect, 2, "seconds"),
         (charts.draw_labels, 3, "dt"),
-        (figures.draw_petals, 2, "every"),
+        (maps.draw_petals, 2, "every"),
         (canvas.save_figure, 2, "dpi"),
         (a1_lessons.show_walk, 3, "count"),
         (a1_lessons.show_walk, 3, "columns"),

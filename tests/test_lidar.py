@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from fgtutor import mapping
-from fgtutor.cloudfiles import save_points
+from fgtutor.cli import map
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import CloudError, ConfigError
-from fgtutor.robots.a1_model import STANCE_HEIGHT, TRUNK_SIZE
+from fgtutor.io.clouds import save_points
+from fgtutor.robots.a1.model import STANCE_HEIGHT, TRUNK_SIZE
 from fgtutor.robots.lidar import LidarConfig, carried, pattern, scan_terrain, survey
-from fgtutor.scanning import ScanConfig, map_points
-from fgtutor.terrain import Box, Terrain, make_terrain
+from fgtutor.world.scanning import ScanConfig, map_points
+from fgtutor.world.terrain import Box, Terrain, make_terrain
 
 SILENT = {"range_noise": 0.0, "angle_noise": 0.0, "position_noise": 0.0, "attitude_noise": 0.0}
 ABOVE = np.array([[4.0, 2.0, 1.5, np.pi, 0.0, 0.0]])
@@ -249,10 +249,10 @@ def test_a_cloud_goes_through_the_map_command(tmp_path: Path) -> None:
     terrain = make_terrain("steps", robot="toy", seed=1)
     save_points(scan_terrain(terrain, config=quick()), tmp_path / "cloud.npz")
     out = tmp_path / "map.npz"
-    config = mapping.MapConfig(
+    config = map.MapConfig(
         cloud=tmp_path / "cloud.npz", out=out, resolution=0.1, area=terrain.elevation.extent
     )
-    assert mapping.run(config) == 0
+    assert map.run(config) == 0
     scanned = ElevationMap.load(out)
     error = np.abs(scanned.heights - terrain.elevation.heights)
     assert np.nanmedian(error) < 0.02

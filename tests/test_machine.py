@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from fgtutor import machine
 from fgtutor.errors import TooLargeError
-from fgtutor.machine import available_memory, require_memory, usable_cores
+from fgtutor.io import machine
+from fgtutor.io.machine import available_memory, require_memory, usable_cores
 
 
 @pytest.mark.parametrize(

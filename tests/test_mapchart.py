@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 
 from fgtutor.evaluation.adaptation import WALL, make_map
-from fgtutor.evaluation.mapchart import DARK, draw_maps
+from fgtutor.figures.maps_svg import DARK, draw_maps
 from fgtutor.planning import plan
 
 

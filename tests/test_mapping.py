@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from cloud_writers import geokeys, las, sheet
 
-from fgtutor import mapping
-from fgtutor.cloudfiles import save_points
+from fgtutor.cli import map
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import CloudError, ConfigError, MapError, StorageError
-from fgtutor.validation import parse_options
+from fgtutor.io.clouds import save_points
+from fgtutor.io.validation import parse_options
 
 
-def command(*options: object) -> mapping.MapConfig:
-    return parse_options(mapping.MapConfig, [str(option) for option in options], "fgtutor map")
+def command(*options: object) -> map.MapConfig:
+    return parse_options(map.MapConfig, [str(option) for option in options], "fgtutor map")
 
 
 def test_map_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -22,7 +22,7 @@ def test_map_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     path, out, statistics = (tmp_path / name for name in ("c.laz", "m.npz", "s.npz"))
     las(path, points[points[:, 0] > 0.2])
     options = ("--out", out, "--statistics", statistics, "--area", 0, 0, 1, 0.6)
-    assert mapping.run(command(path, *options)) == 0
+    assert map.run(command(path, *options)) == 0
     elevation = ElevationMap.load(out)
     assert elevation.shape == (20, 12)
     assert not elevation.known[:4].any() and elevation.known[4:].all()
@@ -34,7 +34,7 @@ def test_map_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "20.0% of the cells are unknown" in printed and "4 points (median)" in printed
     assert printed.endswith("left out or converted: nothing\n")
 
-    assert mapping.run(command(path, *options, "--fill")) == 0
+    assert map.run(command(path, *options, "--fill")) == 0
     filled = ElevationMap.load(out)
     assert np.isfinite(filled.heights).all()
     np.testing.assert_array_equal(filled.known, elevation.known)
@@ -44,13 +44,13 @@ def test_map_command_refuses_early_and_keeps_the_old_map(tmp_path: Path) -> None
     out = tmp_path / "map.npz"
     out.write_text("old")
     with pytest.raises(CloudError, match="check the path"):
-        mapping.run(command(tmp_path / "none.las", "--out", out))
+        map.run(command(tmp_path / "none.las", "--out", out))
     # Before it reads the cloud, which is not there either.
     with pytest.raises(StorageError, match="create the folder"):
-        mapping.run(command(tmp_path / "none.las", "--out", tmp_path / "no" / "map.npz"))
+        map.run(command(tmp_path / "none.las", "--out", tmp_path / "no" / "map.npz"))
     save_points(sheet(), tmp_path / "cloud.npz")
     with pytest.raises(MapError, match=r"\.bmp"):
-        mapping.run(command(tmp_path / "cloud.npz", "--out", tmp_path / "map.bmp"))
+        map.run(command(tmp_path / "cloud.npz", "--out", tmp_path / "map.bmp"))
     assert out.read_text() == "old"
 
 
@@ -69,7 +69,7 @@ def test_the_last_line_says_what_was_left_out_and_why(
     feet = everything / (1200 / 3937)
     las(path, feet, scale=1e-5, records=(keys,), classification=classes, withheld=withheld)
     options = ("--out", tmp_path / "m.npz", "--area", 0, 0, 1, 0.6)
-    assert mapping.run(command(path, *options)) == 0
+    assert map.run(command(path, *options)) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.removeprefix("left out or converted: ").split("; ") == [
         "7 points of the noise classes 7 and 18",
@@ -94,5 +94,5 @@ def test_areas_that_cannot_be_are_refused(tmp_path: Path, area: tuple, message: 
     save_points(sheet(), tmp_path / "cloud.npz")
     out = tmp_path / "map.npz"
     with pytest.raises((CloudError, ConfigError), match=message):
-        mapping.run(command(tmp_path / "cloud.npz", "--out", out, "--area", *area))
+        map.run(command(tmp_path / "cloud.npz", "--out", out, "--area", *area))
     assert not out.exists()

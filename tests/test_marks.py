@@ -14,10 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from fgtutor.__main__ import UNREAD, USAGE, main
-from fgtutor.errors import ConfigError, StorageError
-from fgtutor.teach import grading
-from fgtutor.teach.checks import check, find, questions_of
-from fgtutor.teach.checks.question import (
+from fgtutor.course.checks import check, find, questions_of
+from fgtutor.course.checks.question import (
     CRASHED,
     NOT_STARTED,
     OUTCOMES,
@@ -26,8 +24,9 @@ from fgtutor.teach.checks.question import (
     Verdict,
     plain_name,
 )
-from fgtutor.teach.grading import GradeConfig, grade
-from fgtutor.teach.marks import (
+from fgtutor.course.grading import grade as grading
+from fgtutor.course.grading.grade import GradeConfig, grade
+from fgtutor.course.grading.marks import (
     Mark,
     by_learner,
     gradescope,
@@ -36,7 +35,8 @@ from fgtutor.teach.marks import (
     settle_clashes,
     table,
 )
-from fgtutor.teach.values import encode
+from fgtutor.course.grading.values import encode
+from fgtutor.errors import ConfigError, StorageError
 from tests.test_grading import HONEST, QUICK, submit
 from tests.test_submissions import ANY
 

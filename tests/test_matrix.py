@@ -21,7 +21,7 @@ from fgtutor.evaluation.success import (
 )
 from fgtutor.evaluation.trials import Ground, Trial, drive
 from fgtutor.execution import FollowConfig
-from fgtutor.terrain import make_terrain
+from fgtutor.world.terrain import make_terrain
 
 
 @pytest.fixture

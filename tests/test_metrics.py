@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fgtutor.errors import ConfigError
-from fgtutor.evaluation.metrics import calibration, spl, wilson_interval
+from fgtutor.statistics import calibration, spl, wilson_interval
 
 
 def test_wilson_interval_of_a_known_case():

@@ -11,9 +11,9 @@ import pytest
 from nbformat.v4 import new_code_cell, new_notebook, new_output
 from PIL import Image
 
+from fgtutor.course import notebooks
+from fgtutor.course.notebooks import NotebooksConfig, budget, find_drift, find_faults, read_source
 from fgtutor.errors import ConfigError, NotebookError
-from fgtutor.teach import notebooks
-from fgtutor.teach.notebooks import NotebooksConfig, budget, find_drift, find_faults, read_source
 
 COURSE = Path(__file__).parent.parent / "notebooks"
 SOURCES = sorted((COURSE / "src").glob("*.py"))

@@ -12,14 +12,14 @@ from fgtutor import __main__ as cli
 from fgtutor.baselines import OccupancyConfig, TraversabilityConfig
 from fgtutor.errors import ConfigError, TerrainError
 from fgtutor.execution import FollowConfig
-from fgtutor.obstacles import TerrainScale
-from fgtutor.robots.a1_bodies import A1EnvConfig
-from fgtutor.robots.a1_model import A1Config
-from fgtutor.robots.a1_terms import RewardWeights
+from fgtutor.robots.a1.model import A1Config
+from fgtutor.robots.a1.observation import RewardWeights
+from fgtutor.robots.a1.randomise import A1EnvConfig
 from fgtutor.robots.commands import EnvConfig
 from fgtutor.robots.lidar import LidarConfig
 from fgtutor.robots.toy import ToyModel
-from fgtutor.scanning import ScanConfig
+from fgtutor.world.obstacles import TerrainScale
+from fgtutor.world.scanning import ScanConfig
 
 NEEDED: dict[str, Any] = {
     "map": Path("map.npz"),

@@ -18,7 +18,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 SOURCES = sorted((ROOT / "fgtutor").rglob("*.py"))
 INSTALLED = packages_distributions()
-COURSE = {"teach"}
+COURSE = {"course"}
 """Folders of fgtutor that may need the extra `lab`."""
 UNSEEN = {
     "tensorboard": "torch.utils.tensorboard",

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from fgtutor.course.widgets.painting import Painting
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.teach.painting import Painting
 from fgtutor.tensorization import assess
 
 

@@ -20,7 +20,7 @@ from fgtutor.patches import (
     sample_heights,
     sample_patches,
 )
-from fgtutor.terrain import make_terrain
+from fgtutor.world.terrain import make_terrain
 
 GRID = PatchGrid(ahead=0.3, behind=0.1, half_width=0.1, spacing=0.1, footprint=(0.1, 0.1))
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from fgtutor.errors import ConfigError, SimulationError
-from fgtutor.robots import a1_model
-from fgtutor.robots.physics import Physics
-from fgtutor.terrain import make_terrain
+from fgtutor.robots.a1 import model as a1_model
+from fgtutor.robots.a1.physics import Physics
+from fgtutor.world.terrain import make_terrain
 
 SIMS = 6
 

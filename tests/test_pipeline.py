@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from fgtutor import patches, pipeline, progress
+from fgtutor import patches
+from fgtutor.cli.plan import PlanConfig, choose, run
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import (
     ConfigError,
@@ -16,7 +17,8 @@ from fgtutor.errors import (
     ThresholdError,
     UnknownCellError,
 )
-from fgtutor.pipeline import PlanConfig, choose, plan_on_map, run
+from fgtutor.io import progress
+from fgtutor.pipeline import plan_on_map
 from fgtutor.planning import Route
 from fgtutor.specialist import save_specialist
 

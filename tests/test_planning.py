@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fgtutor import directions, machine
+from fgtutor import directions
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import (
     ConfigError,
@@ -24,6 +24,7 @@ from fgtutor.errors import (
 from fgtutor.fusion import fuse
 from fgtutor.graphs import reversed_graph
 from fgtutor.grid import point_text
+from fgtutor.io import machine
 from fgtutor.planning import Planner, Route, as_networkx, as_switching_networkx, plan
 from fgtutor.tensorization import steps_on_known
 

@@ -4,8 +4,8 @@ import threading
 
 import pytest
 
-from fgtutor import progress
-from fgtutor.progress import duration, waiting, watch
+from fgtutor.io import progress
+from fgtutor.io.progress import duration, waiting, watch
 
 
 def test_the_parts_pass_through_unchanged_and_unseen(capsys):

@@ -9,10 +9,11 @@ from xml.etree import ElementTree
 import pytest
 
 from fgtutor.errors import ReportError
-from fgtutor.evaluation.chart import share_chart
-from fgtutor.evaluation.report import Findings, Share, markdown, write_report
-from fgtutor.evaluation.runner import Result
+from fgtutor.evaluation.report import Findings, markdown, write_report
 from fgtutor.evaluation.shards import Run
+from fgtutor.evaluation.tasks import Result
+from fgtutor.figures.rates_svg import share_chart
+from fgtutor.statistics import Share
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "readme_table.py"
 ROWS = [{"seed": seed, "outcome": "reached", "length": 8.1} for seed in range(3)]

@@ -11,7 +11,7 @@ from fgtutor.patches import sample_patches
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.robots.base import UNTRIED
 from fgtutor.robots.commands import EnvConfig, slowdown, tracking_reward, turn_rate
-from fgtutor.terrain import World, make_terrain
+from fgtutor.world.terrain import World, make_terrain
 
 robots = pytest.mark.parametrize("robot", sorted(ROBOTS))
 

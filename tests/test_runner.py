@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from fgtutor.errors import ConfigError, EvaluationError, MissingExtraError, TerrainError
-from fgtutor.evaluation.runner import ATTEMPTS, Task, run_tasks
+from fgtutor.evaluation.tasks import ATTEMPTS, Task, run_tasks
 
 # Workers import the tasks' functions, so they live in a module of their own, on the path.
 WORK = """
@@ -114,7 +114,7 @@ def test_a_task_that_always_kills_its_worker_is_named(work, tmp_path):
 def test_workers_end_with_whoever_is_killed(work, tmp_path):
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import fgtutor_work as work\n"
-        "from fgtutor.evaluation.runner import Task, run_tasks\n"
+        "from fgtutor.evaluation.tasks import Task, run_tasks\n"
         "tasks = [Task(name='a', function=work.left_alone, arguments=(sys.argv[1],)),\n"
         "         Task(name='b', function=work.square, arguments=(2,))]\n"
         "if __name__ == '__main__': list(run_tasks(tasks, workers=2))"

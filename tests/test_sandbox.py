@@ -11,14 +11,15 @@ from pathlib import Path
 
 import pytest
 
+from fgtutor.course.grading import grade as grading
+from fgtutor.course.grading import sandbox
+from fgtutor.course.grading.asking import CRASHED, NOT_STARTED, TOO_SLOW
+from fgtutor.course.grading.confinement import WALLS, landlock_version
+from fgtutor.course.grading.grade import GradeConfig, grade
+from fgtutor.course.grading.marks import table
+from fgtutor.course.grading.sandbox import Limits, ask_submission
+from fgtutor.course.grading.values import encode
 from fgtutor.errors import ConfigError, GradingError
-from fgtutor.teach import grading, sandbox
-from fgtutor.teach.asking import CRASHED, NOT_STARTED, TOO_SLOW
-from fgtutor.teach.confinement import WALLS, landlock_version
-from fgtutor.teach.grading import GradeConfig, grade
-from fgtutor.teach.marks import table
-from fgtutor.teach.sandbox import Limits, ask_submission
-from fgtutor.teach.values import encode
 from tests.test_grading import HONEST, QUICK, submit
 
 SHORT = Limits(seconds=0.5, idle=0.5)
@@ -43,7 +44,7 @@ def children(parent: int) -> Iterator[int]:
             text, command = stat.read_text(), stat.with_name("cmdline").read_text()
         except OSError:  # it has just ended
             continue
-        if int(text.rpartition(")")[2].split()[1]) == parent and "teach.worker" in command:
+        if int(text.rpartition(")")[2].split()[1]) == parent and "grading.worker" in command:
             yield int(stat.parent.name)
 
 
@@ -156,7 +157,7 @@ def test_stopping_ends_what_runs():
 def test_nothing_outlives_the_grader(tmp_path, how):
     path = submit(tmp_path, "ada", "import time\nwhile True: time.sleep(999)")
     code = (
-        "import signal\nfrom pathlib import Path\nfrom fgtutor.teach.grading import *\n"
+        "import signal\nfrom pathlib import Path\nfrom fgtutor.course.grading.grade import *\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"grade(GradeConfig(paths=(Path({str(path)!r}),)))\n"
     )

@@ -8,10 +8,10 @@ from cloud_writers import cloud, sheet
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fgtutor import scanning
 from fgtutor.errors import CloudError, ConfigError
 from fgtutor.grid import MOST_CELLS
-from fgtutor.scanning import WALL, ScanConfig, map_points
+from fgtutor.world import scanning
+from fgtutor.world.scanning import WALL, ScanConfig, map_points
 
 # -- cells -----------------------------------------------------------------------------------------
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from fgtutor.errors import ConfigError, ReportError, StorageError
-from fgtutor.evaluation.runner import Task
 from fgtutor.evaluation.shards import RunConfig, collect, settings_of
+from fgtutor.evaluation.tasks import Task
 
 
 @dataclass(frozen=True, kw_only=True)

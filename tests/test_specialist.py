@@ -20,11 +20,12 @@ from rsl_rl.modules.distribution import HeteroscedasticGaussianDistribution
 from tensordict import TensorDict
 
 from fgtutor.__main__ import main
-from fgtutor.dreamwaq import DreamWaQModel
 from fgtutor.errors import FgtutorError, SpecialistError, StorageError
 from fgtutor.feasibility import FeasibilityNet
 from fgtutor.patches import PatchGrid
-from fgtutor.policies import POLICIES, Noise, PolicyConfig, register_policy
+from fgtutor.policies.description import POLICIES, Noise, PolicyConfig, register_policy
+from fgtutor.policies.dreamwaq import DreamWaQModel
+from fgtutor.policies.symmetry import SymmetricMLPModel
 from fgtutor.specialist import (
     SCHEMA,
     Specialist,
@@ -33,7 +34,6 @@ from fgtutor.specialist import (
     load_zoo,
     save_specialist,
 )
-from fgtutor.symmetry import SymmetricMLPModel
 
 FILES = ("policy.safetensors", "feasibility.safetensors", "specialist.json")
 
@@ -396,7 +396,7 @@ class ScaledPolicy(MLPModel):
 def test_a_registered_policy_class_comes_back_with_its_options(
     make_specialist, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("fgtutor.policies.POLICIES", dict(POLICIES))
+    monkeypatch.setattr("fgtutor.policies.description.POLICIES", dict(POLICIES))
     groups = TensorDict({"policy": torch.zeros(1, 6), "patch": torch.zeros(1, 30)}, [1])
     policy = ScaledPolicy(groups, {"actor": ["policy", "patch"]}, "actor", 3, [8], scale=2.5)
     specialist = make_specialist(policy=policy)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from fgtutor import storage
 from fgtutor.errors import StorageError
-from fgtutor.storage import LOCK, atomic_write, atomic_write_all, check_writable, locked_folder
+from fgtutor.io import storage
+from fgtutor.io.storage import LOCK, atomic_write, atomic_write_all, check_writable, locked_folder
 
 
 def test_new_file_appears_complete(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_block_that_wrote_nothing_is_an_error(tmp_path: Path) -> None:
 _LIMITED = """
 import resource, signal, sys
 from fgtutor.errors import StorageError
-from fgtutor.storage import atomic_write
+from fgtutor.io.storage import atomic_write
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 try:
@@ -122,7 +122,7 @@ def test_real_write_failure_leaves_nothing_partial(tmp_path: Path) -> None:
 
 _KILLED = """
 import os, signal, sys
-from fgtutor.storage import atomic_write
+from fgtutor.io.storage import atomic_write
 with atomic_write(sys.argv[1]) as temporary:
     temporary.write_bytes(bytes(100_000))
     os.kill(os.getpid(), signal.SIGKILL)
@@ -236,7 +236,7 @@ def test_files_that_belong_together_change_together(
 
 _HOLDING = """
 import sys, time
-from fgtutor.storage import locked_folder
+from fgtutor.io.storage import locked_folder
 with locked_folder(sys.argv[1]):
     print("locked", flush=True)
     time.sleep(60)

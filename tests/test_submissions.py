@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fgtutor.errors import ConfigError, NotebookError
-from fgtutor.teach.checks.question import plain_name
-from fgtutor.teach.submissions import (
+from fgtutor.course.checks.question import plain_name
+from fgtutor.course.grading.submissions import (
     LARGEST_CODE,
     LARGEST_NOTEBOOK,
     base_of,
@@ -22,6 +21,7 @@ from fgtutor.teach.submissions import (
     learners_of,
     read_submission,
 )
+from fgtutor.errors import ConfigError, NotebookError
 from tests.test_grading import HONEST, submit
 
 
@@ -287,7 +287,7 @@ def test_what_the_system_keeps_from_us_is_no_fault_of_theirs(tmp_path):
     code = """
 import os, sys
 from pathlib import Path
-from fgtutor.teach.submissions import find_notebooks, read_submission
+from fgtutor.course.grading.submissions import find_notebooks, read_submission
 os.chdir(sys.argv[1])
 if os.geteuid() == 0:
     os.setresuid(65534, 65534, 65534)

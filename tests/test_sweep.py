@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from fgtutor import __main__ as cli
-from fgtutor import training
 from fgtutor.errors import (
     CheckpointError,
     ConfigError,
@@ -21,7 +20,6 @@ from fgtutor.errors import (
     TerrainError,
 )
 from fgtutor.evaluation import sweep
-from fgtutor.evaluation.runner import run_tasks
 from fgtutor.evaluation.sweep import (
     A1SweepConfig,
     SweepConfig,
@@ -32,8 +30,10 @@ from fgtutor.evaluation.sweep import (
     table,
     trainings,
 )
+from fgtutor.evaluation.tasks import run_tasks
 from fgtutor.evaluation.trials import Trial
-from fgtutor.recipe import A1TrainConfig, TrainConfig
+from fgtutor.learning import training
+from fgtutor.learning.config import A1TrainConfig, TrainConfig
 from fgtutor.specialist import load_specialist
 
 TINY = TrainConfig(
@@ -266,7 +266,7 @@ def test_the_number_of_workers_changes_nothing(whole, config, capsys, monkeypatc
 KILLED = """
 import os, signal
 from fgtutor.evaluation import sweep
-from fgtutor.training import Trainer
+from fgtutor.learning.training import Trainer
 
 def killed_once(work, trials):
     if not work.config.folder.exists():

@@ -24,7 +24,7 @@ from fgtutor.evaluation.switching import (
 )
 from fgtutor.fusion import fuse
 from fgtutor.planning import plan
-from fgtutor.terrain import SCALES, make_terrain
+from fgtutor.world.terrain import SCALES, make_terrain
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 
 from fgtutor.errors import ConfigError
-from fgtutor.policies import register_policy
+from fgtutor.policies.description import register_policy
+from fgtutor.policies.symmetry import Mirror, SymmetricMLP, SymmetricMLPModel, join
 from fgtutor.specialist import load_specialist, save_specialist
-from fgtutor.symmetry import Mirror, SymmetricMLP, SymmetricMLPModel, join
 
 MIRROR = Mirror(
     observation_index=(1, 0, 2, 3),

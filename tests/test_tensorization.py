@@ -8,9 +8,10 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fgtutor import directions, machine, patches, progress, tensorization
+from fgtutor import directions, patches, tensorization
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, ThresholdError, TooLargeError
+from fgtutor.io import machine, progress
 from fgtutor.patches import PatchGrid
 from fgtutor.tensorization import (
     assess,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import OffMapError, TerrainError
 from fgtutor.patches import PatchGrid, prepare, sample_patches
-from fgtutor.terrain import (
+from fgtutor.world.terrain import (
     SCALES,
     TERRAINS,
     Box,

@@ -7,7 +7,7 @@ import torch
 from fgtutor.elevation import ElevationMap
 from fgtutor.robots.commands import EnvConfig
 from fgtutor.robots.toy import LANE, ToyEnv, polyline
-from fgtutor.terrain import Terrain, World
+from fgtutor.world.terrain import Terrain, World
 
 
 def on(heights, poses, speed=0.8):

@@ -13,10 +13,10 @@ import torch
 
 from fgtutor import __main__ as cli
 from fgtutor.errors import CheckpointError, ConfigError, DivergedError, StorageError
-from fgtutor.recipe import TrainConfig
-from fgtutor.storage import locked_folder
-from fgtutor.trainer import Trainer, read_checkpoint
-from fgtutor.training import train
+from fgtutor.io.storage import locked_folder
+from fgtutor.learning.config import TrainConfig
+from fgtutor.learning.trainer import Trainer, read_checkpoint
+from fgtutor.learning.training import train
 
 TINY = TrainConfig(
     num_envs=4, steps=8, rows=2, columns=2, label_seconds=0.12, save_every=2, iterations=4
@@ -102,7 +102,7 @@ def test_killed_between_snapshot_and_checkpoint_both_ways_on_are_open(copy, tmp_
     trainer.resume()
     trainer.iterate()
     trainer.iterate()
-    monkeypatch.setattr("fgtutor.trainer.write_checkpoint", killed)
+    monkeypatch.setattr("fgtutor.learning.trainer.write_checkpoint", killed)
     with pytest.raises(KeyboardInterrupt):
         trainer.save()
     monkeypatch.undo()
@@ -153,7 +153,8 @@ def test_a_learning_rate_that_is_far_too_high_is_told_on_the_command_line(tmp_pa
 )
 def test_a_signal_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path, number, code, reached):
     code_of_it = (
-        "import os, sys; from fgtutor import __main__ as cli; from fgtutor.trainer import Trainer\n"
+        "import os, sys; from fgtutor import __main__ as cli\n"
+        "from fgtutor.learning.trainer import Trainer\n"
         "iterate = Trainer.iterate\n"
         "def told(self):\n"
         f"    self.iteration == 2 and os.kill(os.getpid(), {int(number)})\n"

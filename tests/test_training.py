@@ -11,10 +11,9 @@ import pytest
 import torch
 
 from fgtutor.errors import CheckpointError, ConfigError, StorageError
-from fgtutor.ppo import feasibility_labels
-from fgtutor.specialist import load_specialist
-from fgtutor.trainer import read_checkpoint, write_checkpoint
-from fgtutor.training import (
+from fgtutor.learning.ppo import feasibility_labels
+from fgtutor.learning.trainer import read_checkpoint, write_checkpoint
+from fgtutor.learning.training import (
     A1TrainConfig,
     TrainConfig,
     Trainer,
@@ -22,6 +21,7 @@ from fgtutor.training import (
     train,
     training_world,
 )
+from fgtutor.specialist import load_specialist
 
 TINY = {
     "num_envs": 4,
@@ -113,7 +113,7 @@ def run_in_subprocess(folder, resume, until=None):
     """Train in a process of its own; kill it (SIGKILL) once the checkpoint holds `until`."""
     settings = TINY | {"terrain": "steps", "resume": resume}
     code = (
-        "import sys, json, pathlib; from fgtutor.training import TrainConfig, train\n"
+        "import sys, json, pathlib; from fgtutor.learning.training import TrainConfig, train\n"
         f"train(TrainConfig(out=pathlib.Path({str(folder)!r}), **{settings!r}))"
     )
     process = subprocess.Popen(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fgtutor.errors import ConfigError, MapError
-from fgtutor.validation import (
+from fgtutor.io.validation import (
     Count,
     Name,
     Positive,
@@ -155,7 +155,7 @@ def test_a_record_that_does_not_fit_is_refused_with_the_place(old, new, says):
 def test_a_file_that_is_missing_or_too_large_is_refused(tmp_path, monkeypatch):
     with pytest.raises(MapError, match="cannot read"):
         read_record(Record, tmp_path / "none.json", MapError)
-    monkeypatch.setattr("fgtutor.validation.LARGEST_RECORD", 10)
+    monkeypatch.setattr("fgtutor.io.validation.LARGEST_RECORD", 10)
     (tmp_path / "r.json").write_text(GOOD)
     with pytest.raises(MapError, match="more than 10"):
         read_record(Record, tmp_path / "r.json", MapError)

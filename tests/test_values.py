@@ -6,10 +6,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from fgtutor.course.checks import find
+from fgtutor.course.checks.question import CRASHED, WRONG, Judge
+from fgtutor.course.grading.values import decode, difference, encode
 from fgtutor.errors import ConfigError
-from fgtutor.teach.checks import find
-from fgtutor.teach.checks.question import CRASHED, WRONG, Judge
-from fgtutor.teach.values import decode, difference, encode
 
 Q1, Q3 = "ex10.q1", "ex10.q3"
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
+from fgtutor.course.widgets.explorer import Explorer
+from fgtutor.course.widgets.tau_views import TauView
 from fgtutor.elevation import ElevationMap
-from fgtutor.teach.explorer import Explorer
-from fgtutor.teach.tau_views import TauView
 from fgtutor.tensorization import Assessment
-from fgtutor.terrain import make_terrain
+from fgtutor.world.terrain import make_terrain
 
 NAMES = ("steps", "gaps", "slopes")
 START, GOAL = (0.25, 0.25), (4.25, 3.25)
@@ -43,7 +43,6 @@ def widgets():
     """The module of the widgets, which needs the lab extra."""
     pytest.importorskip("ipywidgets", reason="the lab extra is not installed: make test does")
     pytest.importorskip("anywidget", reason="the lab extra is not installed: make test does")
-    from fgtutor.teach import widgets
 
     return widgets
 
@@ -54,7 +53,7 @@ def say(board, **content) -> None:
 
 
 def test_a_drag_redraws_and_the_text_follows(widgets, grid, said):
-    board = widgets.TauExplorer(grid, said, START, GOAL)
+    board = views.TauExplorer(grid, said, START, GOAL)
     before = dict(board.view.pictures), board.view.frame
     board.taus.value = (0.2, 0.7)
     alone = Explorer(grid, said, START, GOAL, taus=(0.2, 0.7))
@@ -71,7 +70,7 @@ def test_a_drag_redraws_and_the_text_follows(widgets, grid, said):
 
 
 def test_clicks_arrows_and_hovering_reach_the_explorer(widgets, grid, said):
-    board = widgets.TauExplorer(grid, said, START, GOAL)
+    board = views.TauExplorer(grid, said, START, GOAL)
     say(board, kind="press", cells=[[2, 5]], shift=False)
     assert board.explorer.settings.goal == grid.centre_of(2, 5)
     say(board, kind="drag", cells=[[3, 5], [4, 6]], shift=False)
@@ -93,7 +92,7 @@ def test_clicks_arrows_and_hovering_reach_the_explorer(widgets, grid, said):
 
 
 def test_a_painter_paints_what_is_dragged_over(widgets, make_specialist):
-    board = widgets.TerrainPainter(ElevationMap(np.zeros((20, 16))), make_specialist())
+    board = views.TerrainPainter(ElevationMap(np.zeros((20, 16))), make_specialist())
     before = dict(board.view.pictures)
     board.height.value, board.radius.value = 0.3, 0.1
     say(board, kind="drag", cells=[[5, 5], [8, 5]], shift=False)
@@ -109,7 +108,7 @@ def test_a_painter_paints_what_is_dragged_over(widgets, make_specialist):
 
 
 def test_a_drive_plays_pauses_and_resets(widgets, make_rolling):
-    board = widgets.DriveA1(make_terrain("flat", robot="toy"), {"steps": make_rolling()})
+    board = views.DriveA1(make_terrain("flat", robot="toy"), {"steps": make_rolling()})
     first = board.image.value
     assert Image.open(io.BytesIO(first)).size == (720, 272)
     board.speed.value = 0.5
@@ -128,7 +127,7 @@ def test_without_anywidget_there_is_a_png(widgets):
         "import numpy as np, torch\n"
         "from fgtutor.elevation import ElevationMap\n"
         "from fgtutor.tensorization import Assessment\n"
-        "from fgtutor.teach.widgets import TauExplorer\n"
+        "from fgtutor.course.widgets.views import TauExplorer\n"
         "f = torch.zeros(4, 3, 8); f[..., 0] = 1\n"
         "said = Assessment(f, torch.full((4, 3, 8), 0.5))\n"
         "M = ElevationMap(np.zeros((4, 3)))\n"
@@ -148,6 +147,6 @@ def test_without_anywidget_there_is_a_png(widgets):
 
 def test_the_front_end_is_shipped_and_asks_no_network(widgets):
     for name in ("panels.js", "panels.css"):
-        text = (widgets.STATIC / name).read_text(encoding="utf-8")
+        text = (views.STATIC / name).read_text(encoding="utf-8")
         assert "://" not in text and "import " not in text
-    assert "export default" in widgets.CanvasView._esm
+    assert "export default" in views.CanvasView._esm

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgtutor.teach.explorer import Explorer
+from fgtutor.course.widgets.explorer import Explorer
 
 ROOT = Path(__file__).parents[1]
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -51,7 +51,7 @@ start, goal = (1.05, 6.45), (11.55, 6.05)
 """Four policies on 128 x 128 cells: the size that a drag is promised to be quick for."""
 CELLS = (
     WORLD,
-    "from fgtutor.teach.widgets import TauExplorer\n"
+    "from fgtutor.course.widgets.views import TauExplorer\n"
     "TauExplorer(M, said, start, goal, taus=(0.1, 2.0), switch_cost=1.0)",
 )
 

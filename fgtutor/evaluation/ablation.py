@@ -13,10 +13,11 @@ from typing import Annotated
 from fgtutor.baselines import planners
 from fgtutor.errors import ConfigError
 from fgtutor.evaluation import success
-from fgtutor.evaluation.report import Share, markdown
-from fgtutor.evaluation.runner import Row
+from fgtutor.evaluation.report import markdown
 from fgtutor.evaluation.success import TrialsConfig, by_cell, summarise
-from fgtutor.validation import Unique
+from fgtutor.evaluation.tasks import Row
+from fgtutor.io.validation import Unique
+from fgtutor.statistics import Share
 
 COMMAND = "evaluate baselines"
 

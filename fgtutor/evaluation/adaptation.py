@@ -24,23 +24,23 @@ from torch import Tensor
 
 from fgtutor.errors import PlanningError, TerrainError
 from fgtutor.evaluation.cost import Cost, estimate
-from fgtutor.evaluation.mapchart import draw_maps
-from fgtutor.evaluation.metrics import spl
 from fgtutor.evaluation.planned import PlannedConfig
-from fgtutor.evaluation.report import Draw, Findings, Share, markdown, run_and_report
-from fgtutor.evaluation.runner import Row, Task
+from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
 from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.success import terrain_seed
+from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.execution import execute_batch
-from fgtutor.obstacles import SCALES, Course
+from fgtutor.figures.maps_svg import draw_maps
+from fgtutor.io.validation import Count, check_arguments
+from fgtutor.io.validation import Share as Fraction
 from fgtutor.pipeline import plan_on_map
 from fgtutor.planning import plan
 from fgtutor.routes import Route
 from fgtutor.specialist import ZOO, Specialist
+from fgtutor.statistics import Share, spl
 from fgtutor.tensorization import tensorize
-from fgtutor.terrain import Section, Terrain, TerrainSeed, rasterise
-from fgtutor.validation import Count, check_arguments
-from fgtutor.validation import Share as Fraction
+from fgtutor.world.obstacles import SCALES, Course
+from fgtutor.world.terrain import Section, Terrain, TerrainSeed, rasterise
 
 COMMAND = "evaluate adaptation"
 CHECKPOINTS = "_checkpoints"

@@ -19,15 +19,15 @@ from torch import Tensor
 from tqdm import tqdm
 
 from fgtutor.errors import ConfigError
-from fgtutor.evaluation.metrics import calibration
 from fgtutor.feasibility import ood_weight
-from fgtutor.ppo import feasibility_labels
+from fgtutor.io.storage import check_writable, write_json
+from fgtutor.io.validation import NonNegative, Seed, check_fields
+from fgtutor.learning.ppo import feasibility_labels
 from fgtutor.robots import env_class
 from fgtutor.specialist import Specialist, load_zoo
-from fgtutor.storage import check_writable, write_json
+from fgtutor.statistics import calibration
 from fgtutor.tensorization import resolve_taus
-from fgtutor.terrain import World, make_terrain
-from fgtutor.validation import NonNegative, Seed, check_fields
+from fgtutor.world.terrain import World, make_terrain
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from fgtutor.execution import FollowConfig, execute_batch
 from fgtutor.planning import plan
 from fgtutor.specialist import Specialist
 from fgtutor.tensorization import assess_all
-from fgtutor.terrain import Terrain
+from fgtutor.world.terrain import Terrain
 
 
 class Estimate(Protocol):

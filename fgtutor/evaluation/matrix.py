@@ -12,12 +12,13 @@ from typing import Annotated
 from fgtutor.baselines import OURS
 from fgtutor.errors import ConfigError
 from fgtutor.evaluation import success
-from fgtutor.evaluation.report import Share, markdown
-from fgtutor.evaluation.runner import Row
+from fgtutor.evaluation.report import markdown
 from fgtutor.evaluation.success import TrialsConfig, by_cell
+from fgtutor.evaluation.tasks import Row
+from fgtutor.io.validation import Unique
 from fgtutor.specialist import GENERAL, Specialist
-from fgtutor.terrain import SCALES
-from fgtutor.validation import Unique
+from fgtutor.statistics import Share
+from fgtutor.world.terrain import SCALES
 
 COMMAND = "evaluate matrix"
 

@@ -17,13 +17,14 @@ from fgtutor.baselines import Layers, View, ours
 from fgtutor.errors import ConfigError, EvaluationError
 from fgtutor.evaluation import success
 from fgtutor.evaluation.provenance import digest
-from fgtutor.evaluation.report import Share, markdown
-from fgtutor.evaluation.runner import Row
+from fgtutor.evaluation.report import markdown
 from fgtutor.evaluation.success import TrialsConfig, by_cell, make_ground, summarise
+from fgtutor.evaluation.tasks import Row
 from fgtutor.evaluation.trials import drive
+from fgtutor.io.validation import Unique
 from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist, load_zoo
-from fgtutor.terrain import SCALES
-from fgtutor.validation import Unique
+from fgtutor.statistics import Share
+from fgtutor.world.terrain import SCALES
 
 COMMAND = "evaluate newcomer"
 STAGES = ("without", "with")

@@ -12,8 +12,8 @@ from annotated_types import Interval
 
 from fgtutor.evaluation.provenance import digest
 from fgtutor.evaluation.shards import RunConfig
+from fgtutor.io.validation import Seed
 from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo
-from fgtutor.validation import Seed
 
 
 @dataclass(frozen=True, kw_only=True)

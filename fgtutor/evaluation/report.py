@@ -19,51 +19,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from fgtutor.evaluation.cost import Estimate
-from fgtutor.evaluation.metrics import wilson_interval
-from fgtutor.evaluation.runner import Row, Task
 from fgtutor.evaluation.shards import Run, RunConfig, collect, finished
-from fgtutor.machine import usable_cores
-from fgtutor.storage import atomic_write, locked_folder, make_folder, write_json
+from fgtutor.evaluation.tasks import Row, Task
+from fgtutor.io.machine import usable_cores
+from fgtutor.io.storage import atomic_write, locked_folder, make_folder, write_json
 
 TABLE, ROWS, RUN, FIGURES = "table.md", "rows.json", "run.json", "figures"
 
 Draw = Callable[[Path], object]
 """Writes a figure to a path: `figure.savefig`, or `lambda path: path.write_text(svg)`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Share:
-    """How many of some trials succeeded, with its 95 % interval (Wilson)."""
-
-    successes: int
-    trials: int
-
-    @classmethod
-    def of(cls, successes: Iterable[bool]) -> Self:
-        """Count successes."""
-        outcomes = [bool(success) for success in successes]
-        return cls(successes=sum(outcomes), trials=len(outcomes))
-
-    @classmethod
-    def reached(cls, trials: Iterable[Row]) -> Self:
-        """Count the trials that reached their goal."""
-        return cls.of(trial["outcome"] == "reached" for trial in trials)
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """The ends of the interval, in [0, 1]."""
-        return wilson_interval(self.successes, self.trials)
-
-    def __str__(self) -> str:
-        """Write percent with as many digits as the trials bear: 96 (87-99), 99.96 (99.90-99.98)."""
-        digits = 0 if self.trials < 1000 else 1 if self.trials < 10_000 else 2
-        share, low, high = (
-            f"{100 * x:.{digits}f}" for x in (self.successes / self.trials, *self.interval)
-        )
-        return f"{share} ({low}-{high})"
 
 
 def markdown(columns: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:

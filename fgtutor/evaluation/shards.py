@@ -21,9 +21,9 @@ from tqdm import tqdm
 
 from fgtutor import __version__
 from fgtutor.errors import ConfigError, ReportError
-from fgtutor.evaluation.runner import Result, Row, Task, run_tasks
-from fgtutor.storage import LOCK, make_folder, write_json
-from fgtutor.validation import Count, CountOrZero, NonNegative, check_fields, read_record
+from fgtutor.evaluation.tasks import Result, Row, Task, run_tasks
+from fgtutor.io.storage import LOCK, make_folder, write_json
+from fgtutor.io.validation import Count, CountOrZero, NonNegative, check_fields, read_record
 
 T = TypeVar("T")
 SETTINGS, SHARDS = "settings.json", "shards"

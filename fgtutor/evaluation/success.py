@@ -18,18 +18,18 @@ from annotated_types import Interval
 from fgtutor.baselines import planners
 from fgtutor.errors import ReportError
 from fgtutor.evaluation import report
-from fgtutor.evaluation.chart import share_chart
 from fgtutor.evaluation.cost import Cost, estimate
-from fgtutor.evaluation.metrics import wilson_interval
 from fgtutor.evaluation.planned import PlannedConfig
-from fgtutor.evaluation.report import Findings, Share
-from fgtutor.evaluation.runner import Row, Task
+from fgtutor.evaluation.report import Findings
 from fgtutor.evaluation.shards import collect, settings_of
+from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.evaluation.trials import Ground, drive
-from fgtutor.storage import check_writable, write_json
-from fgtutor.terrain import Terrain, make_terrain
-from fgtutor.validation import NonNegative
-from fgtutor.validation import Share as Fraction
+from fgtutor.figures.rates_svg import share_chart
+from fgtutor.io.storage import check_writable, write_json
+from fgtutor.io.validation import NonNegative
+from fgtutor.io.validation import Share as Fraction
+from fgtutor.statistics import Share, wilson_interval
+from fgtutor.world.terrain import Terrain, make_terrain
 
 GROUNDS = 25
 """Grounds of one task, where each is driven once."""

@@ -23,28 +23,29 @@ import numpy as np
 from annotated_types import Interval, MinLen
 from tqdm import tqdm
 
-from fgtutor import training
 from fgtutor.baselines import single
 from fgtutor.errors import ConfigError, EvaluationError, FgtutorError, SpecialistError
 from fgtutor.evaluation import calibration, report
 from fgtutor.evaluation.calibration import CalibrationConfig
-from fgtutor.evaluation.chart import share_chart
 from fgtutor.evaluation.cost import on_cores
-from fgtutor.evaluation.metrics import calibration as compare
 from fgtutor.evaluation.provenance import digest
-from fgtutor.evaluation.report import Findings, Share, markdown
-from fgtutor.evaluation.runner import Row, Task
+from fgtutor.evaluation.report import Findings, markdown
 from fgtutor.evaluation.shards import RunConfig, part_of, settings_of
 from fgtutor.evaluation.success import TrialsConfig, by_cell, cut, make_ground
+from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.evaluation.trials import drive
-from fgtutor.machine import usable_cores
-from fgtutor.recipe import A1TrainConfig, TrainConfig, comparable, training_world
+from fgtutor.figures.rates_svg import share_chart
+from fgtutor.io.machine import usable_cores
+from fgtutor.io.storage import make_folder
+from fgtutor.io.validation import Seed, Unique, parse_options
+from fgtutor.learning import training
+from fgtutor.learning.config import A1TrainConfig, TrainConfig, comparable, training_world
+from fgtutor.learning.trainer import CHECKPOINT, Trainer, give_back_memory
 from fgtutor.robots import env_class
 from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist
-from fgtutor.storage import make_folder
-from fgtutor.terrain import SCALES
-from fgtutor.trainer import CHECKPOINT, Trainer, give_back_memory
-from fgtutor.validation import Seed, Unique, parse_options
+from fgtutor.statistics import Share
+from fgtutor.statistics import calibration as compare
+from fgtutor.world.terrain import SCALES
 
 COMMAND, RUNS = "sweep", "runs"
 """Its name, and where in the report folder the run folders lie."""

@@ -23,22 +23,23 @@ from annotated_types import Interval, MinLen
 from fgtutor.baselines import OURS, Planner, View, find_route, ours, single
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, PlanningError, TerrainError
-from fgtutor.evaluation.chart import share_chart
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.planned import PlannedConfig
-from fgtutor.evaluation.report import Draw, Findings, Share, markdown, run_and_report
-from fgtutor.evaluation.runner import Row, Task
+from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
 from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.success import cut, terrain_seed
+from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.execution import FollowConfig, execute_batch
-from fgtutor.obstacles import OBSTACLES, SCALES, Course
+from fgtutor.figures.rates_svg import share_chart
+from fgtutor.io.validation import Count, Positive, Unique, check_arguments
+from fgtutor.io.validation import Share as Fraction
 from fgtutor.robots.lidar import scan_terrain, survey
 from fgtutor.routes import Route
-from fgtutor.scanning import ScanConfig, map_points
 from fgtutor.specialist import GENERAL, Specialist
-from fgtutor.terrain import Section, Terrain, TerrainSeed, rasterise
-from fgtutor.validation import Count, Positive, Unique, check_arguments
-from fgtutor.validation import Share as Fraction
+from fgtutor.statistics import Share
+from fgtutor.world.obstacles import OBSTACLES, SCALES, Course
+from fgtutor.world.scanning import ScanConfig, map_points
+from fgtutor.world.terrain import Section, Terrain, TerrainSeed, rasterise
 
 T = TypeVar("T")
 Error = Annotated[float, Interval(ge=0, le=10)]

@@ -15,7 +15,7 @@ from fgtutor.execution import FollowConfig, execute_batch
 from fgtutor.planning import Cost, Route
 from fgtutor.specialist import Specialist
 from fgtutor.tensorization import Taus
-from fgtutor.terrain import Terrain
+from fgtutor.world.terrain import Terrain
 
 EPISODES = 50
 """Episodes simulated side by side."""

@@ -12,7 +12,7 @@ from fgtutor.errors import ConfigError
 if TYPE_CHECKING:
     from fgtutor.robots.base import LocomotionEnv
 
-ROBOTS = {"toy": ("fgtutor.robots.toy", "ToyEnv"), "a1": ("fgtutor.robots.a1", "A1Env")}
+ROBOTS = {"toy": ("fgtutor.robots.toy", "ToyEnv"), "a1": ("fgtutor.robots.a1.env", "A1Env")}
 """Robot name -> module and environment class. A third robot is one file and one entry here."""
 
 GL_BACKENDS = {"linux": ("egl", "osmesa"), "darwin": ("cgl",), "win32": ("wgl",)}

@@ -19,9 +19,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from fgtutor import patches
-from fgtutor.dreamwaq import VELOCITY, History
 from fgtutor.errors import ConfigError
+from fgtutor.io.validation import Count, check_arguments
 from fgtutor.patches import PatchGrid, sample_patches
+from fgtutor.policies.dreamwaq import VELOCITY, History
+from fgtutor.policies.symmetry import Mirror
 from fgtutor.robots.commands import (
     LOOKAHEAD,
     EnvConfig,
@@ -32,9 +34,7 @@ from fgtutor.robots.commands import (
     turn_rate,
 )
 from fgtutor.robots.lanes import Lanes
-from fgtutor.symmetry import Mirror
-from fgtutor.terrain import TerrainSeed, World
-from fgtutor.validation import Count, check_arguments
+from fgtutor.world.terrain import TerrainSeed, World
 
 
 def plain_tensors(method: Callable[..., Any]) -> Callable[..., Any]:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from fgtutor.validation import Ascending, NonNegative, Share, Unbounded, check_fields
+from fgtutor.io.validation import Ascending, NonNegative, Share, Unbounded, check_fields
 
 Speed = Annotated[float, Interval(ge=0, le=20)]
 """A speed, m/s."""

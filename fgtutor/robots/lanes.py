@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fgtutor.terrain import World
+from fgtutor.world.terrain import World
 
 SPACING = 0.1
 """Distance between the points at which a lane is tabulated, m."""

@@ -19,17 +19,17 @@ from annotated_types import Interval
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from fgtutor.cloudfiles import Points
 from fgtutor.errors import CloudError, ConfigError
-from fgtutor.robots.a1_model import STANCE, STANCE_HEIGHT, add_box, build_spec
-from fgtutor.terrain import Terrain, boxes_from_elevation
-from fgtutor.validation import (
+from fgtutor.io.clouds import Points
+from fgtutor.io.validation import (
     Ascending,
     NonNegative,
     Positive,
     check_arguments,
     check_fields,
 )
+from fgtutor.robots.a1.model import STANCE, STANCE_HEIGHT, add_box, build_spec
+from fgtutor.world.terrain import Terrain, boxes_from_elevation
 
 MOST_RAYS = 10_000_000
 """Rays from one pose; each takes some 100 bytes."""

@@ -23,11 +23,11 @@ from jaxtyping import Bool, Float, Int
 from pymunk.constraints import DampedSpring, GrooveJoint, SimpleMotor
 from torch import Tensor
 
+from fgtutor.io.validation import Ascending, NonNegative, Positive, check_fields
 from fgtutor.patches import PatchGrid, sample_heights
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.robots.commands import EnvConfig
-from fgtutor.terrain import World
-from fgtutor.validation import Ascending, NonNegative, Positive, check_fields
+from fgtutor.world.terrain import World
 
 LANE = 1000.0
 """Vertical distance between the lanes of two robots, m: far beyond anything they can reach."""

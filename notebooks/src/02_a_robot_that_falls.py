@@ -26,7 +26,7 @@
 from fgtutor import make_terrain
 from fgtutor.robots.commands import EnvConfig
 from fgtutor.robots.toy import ToyEnv
-from fgtutor.terrain import World
+from fgtutor.world.terrain import World
 
 terrain = make_terrain("gaps", robot="toy", seed=2)
 env = ToyEnv(World([[terrain]]), num_envs=1, config=EnvConfig(train=False))
@@ -65,9 +65,9 @@ print(f"after {12 * env.control_dt:.2f} s the nose points up by {env.state[0, 0,
 # wheels roll at the commanded speed. How far does it get over gaps?
 
 # %%
+from fgtutor.course.lessons import Scripted, straight_route
 from fgtutor.execution import FollowConfig, execute
-from fgtutor.teach.lessons import Scripted, straight_route
-from fgtutor.teach.videos import film_strip
+from fgtutor.figures.videos import film_strip
 
 
 def roll(observations):
@@ -118,8 +118,8 @@ film_strip(flailing, terrain, route, count=6)
 # norm is not squared.
 
 # %%
+from fgtutor.figures.charts import draw_curves
 from fgtutor.robots.commands import tracking_reward
-from fgtutor.teach.charts import draw_curves
 
 v_hat = torch.tensor([0.85, 0.0])
 speeds = torch.linspace(-0.2, 1.8, 201)
@@ -142,7 +142,7 @@ draw_curves(
 # %%
 import numpy as np
 
-from fgtutor.teach.charts import draw_tracking
+from fgtutor.figures.charts import draw_tracking
 
 steps = make_terrain("steps", robot="toy", difficulty=0.6, seed=2)
 bumpy = execute(straight_route(steps, "roll"), steps, {"roll": Scripted(roll)}, config=patience)
@@ -171,7 +171,7 @@ draw_tracking(bumpy, steps, 0.85, tracking_reward(v, v_hat))
 # %%
 from pathlib import Path
 
-from fgtutor.teach.notebooks import budget
+from fgtutor.course.notebooks import budget
 
 iterations = budget(fast=40, full=85, unit="iterations with 128 robots", each=1.4)
 out = Path("runs") / f"02-gaps-{iterations}"
@@ -183,8 +183,8 @@ out = Path("runs") / f"02-gaps-{iterations}"
 
 # %%
 from fgtutor import train
-from fgtutor.teach.charts import LiveCurve
-from fgtutor.training import TrainConfig
+from fgtutor.figures.charts import LiveCurve
+from fgtutor.learning.training import TrainConfig
 
 live = LiveCurve()
 config = TrainConfig(
@@ -226,7 +226,7 @@ for name, driver in drivers.items():
     passed[name] = (sum(drive.success for drive in drives), trials)
 
 # %%
-from fgtutor.teach.charts import draw_rates
+from fgtutor.figures.charts import draw_rates
 
 draw_rates(passed, title="Who crosses gaps it has never seen?")
 
@@ -261,7 +261,7 @@ film_strip(expert, widest, route, count=12)
 #   run), or train from a shell with `fgtutor train --robot toy --terrain gaps`.
 # - Train on `"slopes"`. Which of the curves look different, and why do fewer episodes fail?
 # - Make a film instead of a strip: `save_video(expert, widest, route, "gaps.mp4")` from
-#   `fgtutor.teach.videos`.
+#   `fgtutor.figures.videos`.
 # - Write a better driver than `roll` by hand: stretch both legs when the middle of the patch says
 #   so. How far do you get?
 #

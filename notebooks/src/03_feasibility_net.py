@@ -24,16 +24,16 @@
 import torch
 
 from fgtutor import make_terrain
+from fgtutor.course.notebooks import budget
 from fgtutor.robots.toy import ToyEnv
-from fgtutor.teach.notebooks import budget
-from fgtutor.terrain import World
+from fgtutor.world.terrain import World
 
 robots = budget(fast=64, full=192, unit="robots, 12 s each", each=0.12)
 tiles = [make_terrain("steps", difficulty=(i % 5 + 1) / 5, seed=2 * i) for i in range(30)]
 env = ToyEnv(World([tiles]), robots, seed=0)
 
 # %%
-from fgtutor.teach.lessons import collect
+from fgtutor.course.lessons import collect
 
 
 def roll(observations):
@@ -61,7 +61,7 @@ rollout = collect(env, roll, seconds=12.0)
 # moment begins one row further on, and the 0.0 of the first row is in no label.
 
 # %%
-from fgtutor.ppo import feasibility_labels
+from fgtutor.learning.ppo import feasibility_labels
 
 r_v, failed, ended = [0.0, 0.9, 0.6, 0.0, 0.8, 0.8], [0, 0, 0, 1, 0, 0], [0, 0, 0, 1, 0, 0]
 six_steps = torch.tensor([r_v, failed, ended]).T[:, None]  # [time, robots, 3]
@@ -77,7 +77,7 @@ print("valid:", valid[:, 0].tolist())
 # Now the real thing, one robot that got stuck:
 
 # %%
-from fgtutor.teach.charts import draw_labels
+from fgtutor.figures.charts import draw_labels
 
 label, valid = feasibility_labels(rollout["tracking"], window=round(1.0 / env.control_dt))
 failures = rollout["tracking"][..., 1].sum(dim=0)
@@ -126,7 +126,7 @@ for _ in tqdm(range(updates)):
     history.append({name: value.item() for name, value in parts.items()})
 
 # %%
-from fgtutor.teach.charts import draw_curves
+from fgtutor.figures.charts import draw_curves
 
 draw_curves(
     range(updates),
@@ -155,8 +155,8 @@ test = collect(exam, roll, seconds=8.0)
 measured, valid = feasibility_labels(test["tracking"], window=round(1.0 / exam.control_dt))
 
 # %%
-from fgtutor.evaluation.metrics import calibration
-from fgtutor.teach.figures import calibration_plot
+from fgtutor.figures.maps import calibration_plot
+from fgtutor.statistics import calibration
 
 with torch.no_grad():
     promised = lazy_net.feasibility(test["patch"][valid], test["command"][valid])
@@ -170,7 +170,7 @@ calibration_plot(*calibration(promised.numpy(), measured[valid].numpy()))
 # ## What does it fear?
 
 # %%
-from fgtutor.teach.lessons import patch_gallery
+from fgtutor.course.lessons import patch_gallery
 
 order = promised.argsort()
 seen = test["patch"][valid]
@@ -195,7 +195,7 @@ patch_gallery(seen[pick], env.grid, captions, title="Least and most feasible for
 import numpy as np
 
 from fgtutor import ElevationMap, load_zoo
-from fgtutor.teach.lessons import patch_at
+from fgtutor.course.lessons import patch_at
 
 steps = load_zoo("toy")["steps"]
 
@@ -266,7 +266,7 @@ draw_curves(
 # losses, and **no shared weights**: the net watches, and never disturbs.
 
 # %%
-from fgtutor.teach.figures import training_curve
+from fgtutor.figures.maps import training_curve
 
 training_curve(steps.provenance["curve"])
 

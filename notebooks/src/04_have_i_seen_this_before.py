@@ -39,7 +39,7 @@ def worst_promise(specialist, ground):
 promises = np.array([[worst_promise(s, g) for g in grounds.values()] for s in zoo.values()])
 
 # %%
-from fgtutor.teach.charts import draw_table
+from fgtutor.figures.charts import draw_table
 
 draw_table(
     promises,
@@ -55,8 +55,8 @@ draw_table(
 # Now let each of them drive each.
 
 # %%
+from fgtutor.course.lessons import straight_route
 from fgtutor.execution import FollowConfig, execute_batch
-from fgtutor.teach.lessons import straight_route
 
 patience = FollowConfig(patience=1.5, grace=2.0)
 tiles = list(grounds.values())
@@ -83,7 +83,7 @@ draw_table(
 
 # %%
 from fgtutor import execute
-from fgtutor.teach.videos import film_strip
+from fgtutor.figures.videos import film_strip
 
 i, j = np.unravel_index((promises * (1 - reached)).argmax(), promises.shape)
 route = straight_route(tiles[j], names[i])
@@ -124,8 +124,8 @@ def rebuild(net, patch):
 # patches it meets.
 
 # %%
+from fgtutor.course.notebooks import budget
 from fgtutor.evaluation.calibration import CalibrationConfig, drive
-from fgtutor.teach.notebooks import budget
 
 settings = CalibrationConfig(envs=budget(fast=16, full=100, unit="robots", each=0.4), seconds=8.0)
 drives = {name: drive(specialist, name, settings) for name, specialist in zoo.items()}
@@ -139,7 +139,7 @@ worlds = {name: rough(one.patch) for name, one in drives.items()}
 {name: len(patches) for name, patches in worlds.items()}
 
 # %%
-from fgtutor.teach.lessons import patch_gallery
+from fgtutor.course.lessons import patch_gallery
 
 grid = zoo["steps"].grid
 home, abroad = (worlds[name][:: len(worlds[name]) // 4][1:3] for name in ("steps", "gaps"))
@@ -178,7 +178,7 @@ print(f"by hand {by_hand:.4f}, by the network {loss[0]:.4f}")
 
 # %%
 from fgtutor.feasibility import TAU_HIGH, TAU_LOW, calibrated_taus
-from fgtutor.teach.charts import draw_losses
+from fgtutor.figures.charts import draw_losses
 
 with torch.no_grad():
     losses = {name: net.reconstruction(patches) for name, patches in worlds.items()}
@@ -261,8 +261,8 @@ draw_table(
 
 # %%
 from fgtutor import ElevationMap
-from fgtutor.demo import GOAL, MAP, START
-from fgtutor.teach.figures import draw_elevation, draw_weight
+from fgtutor.cli.demo import GOAL, MAP, START
+from fgtutor.figures.maps import draw_elevation, draw_weight
 
 M = ElevationMap.load(MAP)
 draw_elevation(M)
@@ -289,8 +289,8 @@ draw_weight(opinions["steps"].ood(low, high), M, "steps")
 # detour, or there is none. (How it is found is notebook 06.)
 
 # %%
-from fgtutor.teach.explorer import Explorer
-from fgtutor.teach.tau_views import tau_figure
+from fgtutor.course.widgets.explorer import Explorer
+from fgtutor.course.widgets.tau_views import tau_figure
 
 tau_figure(Explorer(M, opinions, START, GOAL))
 
@@ -299,7 +299,7 @@ tau_figure(Explorer(M, opinions, START, GOAL))
 # click on the map to set start and goal; hold the pointer over a cell to read its numbers.
 
 # %%
-from fgtutor.teach.widgets import TauExplorer
+from fgtutor.course.widgets.views import TauExplorer
 
 TauExplorer(M, opinions, START, GOAL)
 

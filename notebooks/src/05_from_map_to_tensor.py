@@ -21,7 +21,7 @@
 import numpy as np
 
 from fgtutor import ElevationMap, load_zoo
-from fgtutor.teach.figures import draw_elevation
+from fgtutor.figures.maps import draw_elevation
 
 heights = np.zeros((22, 16))
 heights[8:14, 5:11] = 0.16
@@ -34,7 +34,7 @@ draw_elevation(M)
 # %%
 import torch
 
-from fgtutor.teach.lessons import patch_at
+from fgtutor.course.lessons import patch_at
 
 steps = load_zoo("toy")["steps"]
 net, grid = steps.feasibility, steps.grid
@@ -77,7 +77,7 @@ print("shape", tuple(f.shape), "=", f.numel(), "questions")
 # way.
 
 # %%
-from fgtutor.teach.figures import draw_petals
+from fgtutor.figures.maps import draw_petals
 
 plateau = draw_elevation(M)
 draw_petals(f, M, every=1, axes=plateau.axes[0])
@@ -90,7 +90,7 @@ draw_petals(f, M, every=1, axes=plateau.axes[0])
 # The other way to look at the same tensor is one map for each heading.
 
 # %%
-from fgtutor.teach.lessons import heading_maps
+from fgtutor.course.lessons import heading_maps
 
 heading_maps(f, M, label="f")
 
@@ -119,7 +119,7 @@ print(f"largest difference: {(turned - expected).abs().max():.1e}")
 # few units, laid out like a patch.
 
 # %%
-from fgtutor.teach.lessons import patch_gallery
+from fgtutor.course.lessons import patch_gallery
 
 first = net.head[0]
 weights = first.weight.detach()[:, : grid.num_points] * net.height_scale
@@ -197,7 +197,7 @@ print(f"largest difference from the sliding window: {(at_once - f[..., 0]).abs()
 import time
 
 from fgtutor import assess
-from fgtutor.demo import MAP
+from fgtutor.cli.demo import MAP
 
 big = ElevationMap.load(MAP)
 for method in ("reference", "fast"):
@@ -234,7 +234,7 @@ print(f"steps closed since they leave known ground: {closed.sum():,} of {closed.
 # the stroke are asked again:
 
 # %%
-from fgtutor.teach.widgets import TerrainPainter
+from fgtutor.course.widgets.views import TerrainPainter
 
 TerrainPainter(M, steps)
 

@@ -21,8 +21,8 @@
 
 # %%
 from fgtutor import ElevationMap, load_zoo, tensorize
-from fgtutor.demo import GOAL, MAP, START
-from fgtutor.teach.figures import draw_elevation
+from fgtutor.cli.demo import GOAL, MAP, START
+from fgtutor.figures.maps import draw_elevation
 
 zoo = load_zoo("toy")
 names = tuple(zoo)
@@ -43,7 +43,7 @@ tensors = {name: tensorize(M, zoo[name], taus="calibrated") for name in names}
 import numpy as np
 
 from fgtutor import directions
-from fgtutor.teach.charts import draw_table
+from fgtutor.figures.charts import draw_table
 
 cell = M.cell_of(4.0, 5.6)
 opinions = np.stack([tensors[name][cell].numpy() for name in names])
@@ -75,7 +75,7 @@ fused, policy_map = fuse(list(tensors.values()))
 tuple(fused.shape), tuple(policy_map.shape)
 
 # %%
-from fgtutor.teach.figures import draw_petals, draw_policy_map
+from fgtutor.figures.maps import draw_petals, draw_policy_map
 
 draw_petals(fused, M, policy_map, names)
 
@@ -133,7 +133,7 @@ print(f"cost, added up by hand: {cost:.3f}")
 print(f"cost, says networkx:    {networkx.dijkstra_path_length(graph, (0, 0), (5, 3)):.3f}")
 
 # %%
-from fgtutor.teach.lessons import draw_graph
+from fgtutor.course.lessons import draw_graph
 
 draw_graph(graph, tiny, path, names)
 
@@ -154,7 +154,7 @@ route = plan(fused, policy_map, tensors=list(tensors.values()), **task)
 route
 
 # %%
-from fgtutor.teach.figures import draw_route
+from fgtutor.figures.maps import draw_route
 
 draw_route(route, M)
 
@@ -202,7 +202,7 @@ for x, y in (M.centre_of(ix, shut), (5.7, 6.4)):
 # cost something:
 
 # %%
-from fgtutor.teach.lessons import compare_routes
+from fgtutor.course.lessons import compare_routes
 
 calm = plan(fused, policy_map, tensors=list(tensors.values()), switch_cost=3.0, **task)
 compare_routes(M, {"switching is free (the paper)": route, "a switch costs 3": calm})
@@ -233,7 +233,7 @@ ups = np.array([worst_step(rise, 0) for rise in rises])
 downs = np.array([worst_step(rise, 4) for rise in rises])
 
 # %%
-from fgtutor.teach.charts import draw_curves
+from fgtutor.figures.charts import draw_curves
 
 draw_curves(
     rises,

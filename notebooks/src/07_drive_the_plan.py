@@ -34,7 +34,7 @@ for seed in range(1, 40, 2):
 planned.route
 
 # %%
-from fgtutor.teach.figures import draw_route
+from fgtutor.figures.maps import draw_route
 
 draw_route(planned.route, M)
 
@@ -52,12 +52,12 @@ episode = execute(planned.route, terrain, zoo)
 episode
 
 # %%
-from fgtutor.teach.lessons import draw_drive
+from fgtutor.course.lessons import draw_drive
 
 draw_drive(episode, planned.route, M)
 
 # %%
-from fgtutor.teach.videos import film_strip
+from fgtutor.figures.videos import film_strip
 
 film_strip(episode, terrain, planned.route, count=12)
 
@@ -86,7 +86,7 @@ error = torch.tensor(np.stack((speed - wanted, np.zeros_like(speed)), axis=-1))
 r_v = tracking_reward(error, torch.zeros(2)).numpy()
 
 # %%
-from fgtutor.teach.charts import draw_curves
+from fgtutor.figures.charts import draw_curves
 
 window = round(1 / dt)
 delivered = np.convolve(r_v, np.ones(window) / window, mode="valid")  # the second that follows
@@ -150,8 +150,8 @@ film_strip(attempts[worst], terrain, alone[planned.names[worst]], count=4)
 # and let the robot be mistaken about where it is.
 
 # %%
-from fgtutor.teach.charts import draw_rates
-from fgtutor.teach.notebooks import budget
+from fgtutor.course.notebooks import budget
+from fgtutor.figures.charts import draw_rates
 
 trials = budget(fast=6, full=50, unit="drives for each error", each=0.3)
 rates = {}
@@ -199,7 +199,7 @@ for kind in tqdm(kinds):
     rows += drive(grounds, chosen, everyone, switch_cost=3.0)
 
 # %%
-from fgtutor.teach.charts import draw_table
+from fgtutor.figures.charts import draw_table
 
 
 def crossed(kind, name):
@@ -234,7 +234,7 @@ for name in contestants:
 # **How sure may you be?** With this many trials, this sure:
 
 # %%
-from fgtutor.evaluation.metrics import wilson_interval
+from fgtutor.statistics import wilson_interval
 
 for successes in (0, trials // 2, trials):
     low, high = wilson_interval(successes, trials)

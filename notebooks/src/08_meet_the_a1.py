@@ -17,10 +17,10 @@
 # ## A robot is a page of constants
 #
 # A simulator wants to know lengths, masses, inertias and limits, and nothing else. They all come
-# from the maker's own description; `fgtutor/robots/a1_model.py` names the source of each.
+# from the maker's own description; `fgtutor/robots/a1/model.py` names the source of each.
 
 # %%
-from fgtutor.robots.a1_model import JOINTS, build_spec
+from fgtutor.robots.a1.model import JOINTS, build_spec
 
 model = build_spec().compile()
 print(f"{model.body_mass.sum():.1f} kg, {model.nv} degrees of freedom, {model.nu} motors")
@@ -37,7 +37,7 @@ for name in ("trunk", "FR_hip", "FR_thigh", "FR_calf"):
 # has no motor by what has.*
 
 # %%
-from fgtutor.teach.a1_lessons import draw_postures
+from fgtutor.course.a1_lessons import draw_postures
 
 stance = model.key_qpos[0]
 spread = stance.copy()
@@ -67,8 +67,8 @@ from dataclasses import replace
 import torch
 
 from fgtutor import make_terrain
-from fgtutor.robots.a1 import A1_EPISODES, A1Env
-from fgtutor.terrain import World
+from fgtutor.robots.a1.env import A1_EPISODES, A1Env
+from fgtutor.world.terrain import World
 
 still = replace(A1_EPISODES, train=False)  # nobody draws new episodes for us
 flat = make_terrain("flat", robot="a1")
@@ -87,7 +87,7 @@ for step in range(75):
 # %%
 import numpy as np
 
-from fgtutor.teach.charts import draw_curves
+from fgtutor.figures.charts import draw_curves
 
 t = np.arange(len(rows)) * env.control_dt
 targets, angles, torques = np.array(rows).T
@@ -115,7 +115,7 @@ draw_curves(t, {"torque": torques}, title="What it takes", xlabel="time (s)", yl
 # (Only its velocity no sensor of the A1 measures: a real robot has to estimate it.)
 
 # %%
-from fgtutor.robots.a1_terms import NOISE, SCAN_GRID
+from fgtutor.robots.a1.observation import NOISE, SCAN_GRID
 
 for name, (count, noise, scale) in NOISE.items():
     print(f"{name:12} {count:3} numbers, noise up to {noise:4.2f}, shown to the net times {scale}")
@@ -130,7 +130,7 @@ env.get_observations()["policy"].shape
 
 # %%
 from fgtutor import ElevationMap
-from fgtutor.terrain import Terrain
+from fgtutor.world.terrain import Terrain
 
 rise = 0.4 * np.arange(80) * 0.05  # 4 in 10, up along +x
 slope = ElevationMap(np.tile(rise[:, None], (1, 80)), resolution=0.05)
@@ -164,7 +164,7 @@ draw_postures(dict(zip(ways, four.drawing(), strict=True)), title="One slope, fo
 
 # %%
 from fgtutor import load_zoo
-from fgtutor.robots.a1_terms import SCAN_SCALE
+from fgtutor.robots.a1.observation import SCAN_SCALE
 
 zoo = load_zoo("a1")
 steps, tile = zoo["steps"], make_terrain("steps", robot="a1", difficulty=0.6, seed=5)
@@ -174,7 +174,7 @@ place[:, :2] += trio.offsets[0, 0] - torch.tensor((0.0, 1.6))
 trio.start(torch.arange(3), place.expand(3, 3), steps.command[0])
 
 # %%
-from fgtutor.teach.lessons import draw_windows, patch_gallery
+from fgtutor.course.lessons import draw_windows, patch_gallery
 
 seen = trio.get_observations()
 x, y = (place[0, :2] - trio.offsets[0, 0]).tolist()
@@ -206,7 +206,7 @@ for _ in range(125):
     loads.append(trio.sensed[0, trio.sensors["foot_force"]].reshape(4, 3).norm(dim=-1))
 
 # %%
-from fgtutor.teach.a1_lessons import draw_terms
+from fgtutor.course.a1_lessons import draw_terms
 
 who = ("walks", "stands", "flails")
 draw_terms({
@@ -226,7 +226,7 @@ draw_terms({
 # One term asks for a **gait**: feet in diagonal pairs, by a clock. Did it listen?
 
 # %%
-from fgtutor.teach.a1_lessons import draw_gait
+from fgtutor.course.a1_lessons import draw_gait
 
 draw_gait(torch.stack(loads), trio.control_dt)
 
@@ -242,7 +242,7 @@ draw_gait(torch.stack(loads), trio.control_dt)
 # exactly. It can favour no side, and it needs half of the experience.
 
 # %%
-from fgtutor.robots.a1_model import MIRROR, MIRROR_SIGNS
+from fgtutor.robots.a1.model import MIRROR, MIRROR_SIGNS
 
 mirror, before = trio.mirror, trio.get_observations()
 index, sign = list(mirror.observation_index), torch.tensor(mirror.observation_sign)
@@ -269,9 +269,9 @@ draw_postures({"as it walks": posture, "in the mirror": image})
 # Here is a drive by hand: straight on, a curve to the left, a curve to the right.
 
 # %%
-from fgtutor.teach.a1_lessons import A1View, show_walk
-from fgtutor.teach.driving import Drive
-from fgtutor.teach.lessons import straight_route
+from fgtutor.course.a1_lessons import A1View, show_walk
+from fgtutor.course.lessons import straight_route
+from fgtutor.course.widgets.driving import Drive
 
 ground = make_terrain("steps", robot="a1", difficulty=0.3, seed=5)
 drive = Drive(ground, {"steps": steps}, render=A1View(ground))
@@ -288,14 +288,14 @@ show_walk(drive.episode, ground, straight_route(ground, "steps"))
 # reach further than the robot was trained for, so that you can feel where that ends.
 
 # %%
-from fgtutor.teach.widgets import DriveA1
+from fgtutor.course.widgets.views import DriveA1
 
 DriveA1(ground, zoo, render=A1View(ground))
 
 # %% [markdown]
 # ## What to try
 #
-# - Give `A1Config` (of `fgtutor.robots.a1_model`) half the stiffness, `kp`, and repeat the knee's
+# - Give `A1Config` (of `fgtutor.robots.a1.model`) half the stiffness, `kp`, and repeat the knee's
 #   experiment (`A1Env(..., model=A1Config(kp=17.0))`). What happens to the gap between target and
 #   angle?
 # - In the drive above, put `ground` at difficulty 1.0, or on another terrain. Which policy do you

@@ -23,7 +23,7 @@
 
 # %%
 from fgtutor import load_zoo
-from fgtutor.teach.figures import training_curve
+from fgtutor.figures.maps import training_curve
 
 steps = load_zoo("a1")["steps"]
 record = steps.provenance
@@ -47,9 +47,9 @@ training_curve(record["curve"])
 # %%
 from pathlib import Path
 
-from fgtutor.recipe import A1TrainConfig
+from fgtutor.course.notebooks import budget
+from fgtutor.learning.config import A1TrainConfig
 from fgtutor.specialist import ZOO
-from fgtutor.teach.notebooks import budget
 
 walker = ZOO / "a1" / "_walker"
 robots = budget(fast=48, full=256, unit="robots")
@@ -61,8 +61,8 @@ config = A1TrainConfig(
 )  # fmt: skip
 
 # %%
-from fgtutor.recipe import training_world
-from fgtutor.teach.figures import draw_elevation
+from fgtutor.figures.maps import draw_elevation
+from fgtutor.learning.config import training_world
 
 draw_elevation(training_world(config).elevation)
 
@@ -73,7 +73,7 @@ draw_elevation(training_world(config).elevation)
 # has to write a timetable.
 
 # %%
-from fgtutor.robots.a1 import A1_EPISODES
+from fgtutor.robots.a1.env import A1_EPISODES
 
 print(f"up a row:   mean r_v above {A1_EPISODES.promote_above}, and no fall")
 print(f"down a row: mean r_v below {A1_EPISODES.demote_below}, or a fall in the tile's first half")
@@ -107,7 +107,7 @@ surprise = rewards + gamma * values[1:] - values[:-1]
 # surprises, each a factor $\gamma\lambda$ fainter: that sum is its **advantage**.
 
 # %%
-from fgtutor.teach.charts import draw_curves
+from fgtutor.figures.charts import draw_curves
 
 
 def answer_for(lam):
@@ -140,7 +140,7 @@ import signal
 from dataclasses import replace
 
 from fgtutor import train
-from fgtutor.teach.charts import LiveCurve
+from fgtutor.figures.charts import LiveCurve
 
 live = LiveCurve()
 
@@ -178,7 +178,7 @@ again.draw(mine.provenance["curve"])
 # that a log shows.
 
 # %%
-from fgtutor.training import Trainer
+from fgtutor.learning.training import Trainer
 
 crank = budget(fast=4, full=25, unit="iterations", each=2.0)
 scratch = Trainer(replace(config, start_from=None, out=Path("runs") / "09-from-nothing"))
@@ -236,16 +236,16 @@ exam = [make_terrain("steps", robot="a1", difficulty=0.65, seed=2 * i + 1) for i
 drivers = {"walker": load_specialist(walker), "mine": mine, "steps": steps}
 
 # %%
+from fgtutor.course.a1_lessons import drive_together
+from fgtutor.course.lessons import straight_route
 from fgtutor.execution import FollowConfig
-from fgtutor.teach.a1_lessons import drive_together
-from fgtutor.teach.lessons import straight_route
 
 jobs = [(straight_route(ground, name), ground, i) for name in drivers
         for i, ground in enumerate(exam)]  # fmt: skip
 walks = drive_together(jobs, drivers, config=FollowConfig(patience=1.2, grace=3.0))
 
 # %%
-from fgtutor.teach.charts import draw_rates
+from fgtutor.figures.charts import draw_rates
 
 passed = {
     name: (sum(walk.success for walk in walks[i * count : (i + 1) * count]), count)
@@ -266,8 +266,8 @@ draw_rates(passed, title="Who crosses steps it has never seen?")
 
 # %%
 from fgtutor.evaluation.calibration import CalibrationConfig, drive
-from fgtutor.evaluation.metrics import calibration
-from fgtutor.teach.figures import calibration_plot
+from fgtutor.figures.maps import calibration_plot
+from fgtutor.statistics import calibration
 
 envs = budget(fast=16, full=80, unit="robots, 5 s each", each=0.5)
 exam = drive(steps, "steps", CalibrationConfig(robot="a1", envs=envs, seconds=5.0))

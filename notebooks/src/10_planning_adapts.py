@@ -33,7 +33,7 @@ for name, specialist in stages.items():
 import numpy as np
 import torch
 
-from fgtutor.teach.charts import draw_curves
+from fgtutor.figures.charts import draw_curves
 
 grid = next(iter(stages.values())).grid
 rises = torch.linspace(-0.25, 0.25, 51)
@@ -62,7 +62,7 @@ draw_curves(
 
 # %%
 from fgtutor.evaluation.adaptation import STRAIGHT, WAYS, geodesic, make_map
-from fgtutor.teach.figures import draw_elevation
+from fgtutor.figures.maps import draw_elevation
 
 terrain = make_map("a1", seed=1)
 M, start, goal = terrain.elevation, terrain.start, terrain.goal
@@ -71,7 +71,7 @@ for way, gate in zip(WAYS, terrain.sections, strict=True):
     print(f"{way:6} way: up to {100 * top:.0f} cm, in two steps")
 
 # %%
-from fgtutor.teach.canvas import Picture
+from fgtutor.figures.canvas import Picture
 
 narrow = Picture(4.6, 6.4)
 draw_elevation(M, axes=narrow.subplots())
@@ -94,7 +94,7 @@ for name, (_, route) in plans.items():
 # %%
 from dataclasses import replace
 
-from fgtutor.teach.lessons import compare_routes
+from fgtutor.course.lessons import compare_routes
 
 drawn = {name: "refused" for name in plans}
 drawn |= {name: replace(route, names=("steps",)) for name, route in routes.items()}
@@ -157,9 +157,9 @@ draw_curves(
 # A short route is a claim. Let them walk: each its own route, a few times, all side by side.
 
 # %%
+from fgtutor.course.a1_lessons import drive_together
+from fgtutor.course.notebooks import budget
 from fgtutor.execution import FollowConfig
-from fgtutor.teach.a1_lessons import drive_together
-from fgtutor.teach.notebooks import budget
 
 trials = budget(fast=2, full=12, unit="walks for each stage", each=1.5)
 jobs = [(route, terrain, seed) for route in routes.values() for seed in range(trials)]
@@ -179,7 +179,7 @@ walked = {name: walks[i * trials : (i + 1) * trials] for i, name in enumerate(ro
 # the shortest way over cells that are not wall.
 
 # %%
-from fgtutor.evaluation.metrics import spl
+from fgtutor.statistics import spl
 
 shortest = geodesic(terrain)
 print(f"straight: {STRAIGHT:.1f} m; round the wall: {shortest:.1f} m\n")
@@ -196,7 +196,7 @@ for name, episodes in walked.items():
 # SPL has paid for it in full, however short the way was.
 
 # %%
-from fgtutor.teach.lessons import draw_drive
+from fgtutor.course.lessons import draw_drive
 
 name = list(routes)[-1] if routes else ""
 best = max(walked[name], key=lambda walk: walk.length) if routes else None

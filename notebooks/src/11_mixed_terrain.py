@@ -22,8 +22,8 @@
 from dataclasses import replace
 
 from fgtutor import load_zoo, make_terrain
-from fgtutor.teach.figures import draw_elevation
-from fgtutor.terrain import SCALES
+from fgtutor.figures.maps import draw_elevation
+from fgtutor.world.terrain import SCALES
 
 everyone = load_zoo("a1", include_general=True)
 zoo = {name: s for name, s in everyone.items() if name != "general"}
@@ -36,9 +36,9 @@ def corridor(kind, seed):
 
 # %%
 from fgtutor.baselines import View, find_route, ours
+from fgtutor.course.a1_lessons import daring_route
+from fgtutor.course.notebooks import budget
 from fgtutor.errors import PlanningError
-from fgtutor.teach.a1_lessons import daring_route
-from fgtutor.teach.notebooks import budget
 
 for seed in range(1, 2 * budget(fast=2, full=8, unit="courses at most", each=2.0), 2):
     terrain = corridor("mixed", seed)
@@ -69,8 +69,8 @@ for part in terrain.sections:
 # Four autoencoders look at one corridor.
 
 # %%
-from fgtutor.teach.canvas import Picture
-from fgtutor.teach.figures import draw_weight
+from fgtutor.figures.canvas import Picture
+from fgtutor.figures.maps import draw_weight
 from fgtutor.tensorization import resolve_taus
 
 sheet = Picture(7.2, 6.4)
@@ -92,7 +92,7 @@ sheet
 
 # %%
 from fgtutor import fuse
-from fgtutor.teach.figures import draw_policy_map, draw_route
+from fgtutor.figures.maps import draw_policy_map, draw_route
 
 fused, policy_map = fuse([view.tensor(name) for name in zoo])
 draw_policy_map(policy_map, fused, M, tuple(zoo))
@@ -106,7 +106,7 @@ draw_route(route, M)
 # %%
 import numpy as np
 
-from fgtutor.teach.charts import draw_table
+from fgtutor.figures.charts import draw_table
 
 x = (route.xy[:-1, 0] + route.xy[1:, 0]) / 2
 shares = [
@@ -148,7 +148,7 @@ episode = execute(route, terrain, team, config=follow)
 episode
 
 # %%
-from fgtutor.teach.a1_lessons import show_walk
+from fgtutor.course.a1_lessons import show_walk
 
 show_walk(episode, terrain, route, count=9)
 
@@ -161,7 +161,7 @@ show_walk(episode, terrain, route, count=9)
 
 # %%
 from fgtutor.errors import RenderingError
-from fgtutor.teach.videos import save_video
+from fgtutor.figures.videos import save_video
 
 fps = budget(fast=1, full=12, unit="frames for each second of the walk", each=2.0)
 try:
@@ -170,7 +170,7 @@ except RenderingError:
     print("no graphics library draws here: no film")
 
 # %%
-from fgtutor.teach.lessons import draw_drive
+from fgtutor.course.lessons import draw_drive
 
 draw_drive(episode, route, M)
 
@@ -186,7 +186,7 @@ draw_drive(episode, route, M)
 from collections import Counter
 
 from fgtutor.baselines import planners
-from fgtutor.teach.a1_lessons import drive_together
+from fgtutor.course.a1_lessons import drive_together
 
 contestants = [*zoo, "ours", *(["general"] if "general" in everyone else [])]
 ways = planners(everyone)
@@ -220,7 +220,7 @@ for name in contestants:
     print(f"{name:8}", dict(+table["mixed"][name]))
 
 # %%
-from fgtutor.teach.charts import draw_rates
+from fgtutor.figures.charts import draw_rates
 
 draw_rates(
     {name: (table["mixed"][name]["reached"], trials) for name in contestants},
@@ -264,7 +264,7 @@ draw_table(
 # true rate lies in this range:
 
 # %%
-from fgtutor.evaluation.metrics import wilson_interval
+from fgtutor.statistics import wilson_interval
 
 for kind, total in totals.items():
     low, high = wilson_interval(total, total)

@@ -21,8 +21,8 @@
 # %%
 import numpy as np
 
+from fgtutor.figures.canvas import Picture
 from fgtutor.robots.lidar import LidarConfig, pattern
-from fgtutor.teach.canvas import Picture
 
 sensor, looks = LidarConfig(), Picture(7.2, 3.0)
 for axes, seconds in zip(looks.subplots(1, 2, sharey=True), (0.1, 0.3), strict=True):
@@ -36,9 +36,9 @@ looks
 # course of two terrains and look at it once, from where the robot stands.
 
 # %%
+from fgtutor.course.a1_lessons import draw_cloud
 from fgtutor.evaluation.switching import lay_course
 from fgtutor.robots.lidar import carried, scan_terrain
-from fgtutor.teach.a1_lessons import draw_cloud
 
 terrain = lay_course(("steps", "gaps"), robot="a1", seed=1)
 truth = terrain.elevation
@@ -60,14 +60,14 @@ draw_cloud(glance, sensors=eyes, title="One look of a tenth of a second")
 # lie on top as on level ground nearby: if not, the cell is the floor.
 
 # %%
-from fgtutor.scanning import ScanConfig, map_points
+from fgtutor.world.scanning import ScanConfig, map_points
 
 to_cells = ScanConfig(resolution=truth.resolution)
 first = map_points(glance, config=to_cells, area=truth.extent)
 first
 
 # %%
-from fgtutor.teach.figures import draw_elevation
+from fgtutor.figures.maps import draw_elevation
 
 draw_elevation(first.elevation)
 
@@ -82,8 +82,8 @@ draw_elevation(first.elevation)
 # wrong, as localisation is.
 
 # %%
+from fgtutor.course.notebooks import budget
 from fgtutor.robots.lidar import survey
-from fgtutor.teach.notebooks import budget
 
 spacing = budget(fast=40, full=20, unit="cm between two poses") / 100
 poses = survey(terrain, spacing=spacing)
@@ -104,7 +104,7 @@ draw_elevation(M)
 # In simulation, and only there, we know the truth. Subtract it.
 
 # %%
-from fgtutor.teach.a1_lessons import difference
+from fgtutor.course.a1_lessons import difference
 
 error = difference(M, truth)
 wrong = np.abs(error.heights[error.known])
@@ -151,8 +151,8 @@ for neighbours in (0, to_cells.neighbours):
 # %%
 from fgtutor import load_zoo
 from fgtutor.baselines import View, find_route, ours
+from fgtutor.course.a1_lessons import daring_route
 from fgtutor.errors import PlanningError
-from fgtutor.teach.a1_lessons import daring_route
 
 zoo = load_zoo("a1")
 view = View(M, zoo, "calibrated")
@@ -169,7 +169,7 @@ def route_at(switch_cost):
 free, priced = route_at(0.0), route_at(1.0)
 
 # %%
-from fgtutor.teach.lessons import compare_routes
+from fgtutor.course.lessons import compare_routes
 
 compare_routes(M, {"switching is free (the paper)": free, "a switch costs 1": priced})
 
@@ -181,7 +181,7 @@ compare_routes(M, {"switching is free (the paper)": free, "a switch costs 1": pr
 
 # %%
 from fgtutor import execute
-from fgtutor.teach.a1_lessons import show_walk
+from fgtutor.course.a1_lessons import show_walk
 
 walk = execute(priced, terrain, {name: zoo[name] for name in priced.names})
 walk
@@ -203,7 +203,7 @@ errors = fix * draws[:, 0] + np.cumsum(drift * np.sqrt(dt) * draws[:, 1], axis=-
 t = dt * np.arange(errors.shape[-1])
 
 # %%
-from fgtutor.teach.charts import draw_curves
+from fgtutor.figures.charts import draw_curves
 
 draw_curves(
     t[::25], {f"robot {i}": errors[i, ::25] for i in range(3)},
@@ -232,8 +232,8 @@ draw_curves(
 # price, and a policy takes over only when it has been wanted for a few steps in a row).
 
 # %%
+from fgtutor.course.a1_lessons import drive_together
 from fgtutor.execution import FollowConfig
-from fgtutor.teach.a1_lessons import drive_together
 
 trials = budget(fast=3, full=15, unit="walks a cell, four cells", each=4.0)
 levels = {"exact": (0.0, 0.0), "off by inches": (0.03, 0.02)}
@@ -254,7 +254,7 @@ cells = {
 }
 
 # %%
-from fgtutor.teach.charts import draw_rates
+from fgtutor.figures.charts import draw_rates
 
 draw_rates(
     {name: (sum(w.success for w in ws), trials) for name, ws in cells.items()},
@@ -276,7 +276,7 @@ for name, ws in cells.items():
 # too low. If they lie at edges, it was the position.
 
 # %%
-from fgtutor.teach.lessons import draw_drive
+from fgtutor.course.lessons import draw_drive
 
 manner, level = "careful", "off by inches"
 shown = min(cells[f"{manner}, {level}"], key=lambda w: (w.success, w.length))

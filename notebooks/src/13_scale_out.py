@@ -63,7 +63,7 @@ four, hired = ask(after)
 print(list(after), hired, sep="\n")
 
 # %%
-from fgtutor.teach.lessons import compare_routes
+from fgtutor.course.lessons import compare_routes
 
 compare_routes(M, {"before": answer, "with the newcomer": hired})
 
@@ -78,7 +78,7 @@ for name in before:
 
 # %%
 from fgtutor import fuse
-from fgtutor.teach.figures import draw_policy_map
+from fgtutor.figures.maps import draw_policy_map
 
 fused, policy_map = fuse([four.tensor(name) for name in after])
 draw_policy_map(policy_map, fused, M, tuple(after))
@@ -115,8 +115,8 @@ print(f"better in {(fused > alone).float().mean():.0%} of all cells and headings
 # %%
 import numpy as np
 
-from fgtutor.evaluation.metrics import wilson_interval
-from fgtutor.teach.charts import draw_curves
+from fgtutor.figures.charts import draw_curves
+from fgtutor.statistics import wilson_interval
 
 trials = 20 * np.unique(np.logspace(0, 3, 40).astype(int))
 ends_of = np.array([wilson_interval(19 * n // 20, n) for n in trials.tolist()])
@@ -150,10 +150,10 @@ for cores in (1, 2, 64):
 # the toy show it, which is quicker.
 
 # %%
-from fgtutor.evaluation.runner import Task
+from fgtutor.course.notebooks import budget
 from fgtutor.evaluation.shards import collect, settings_of
 from fgtutor.evaluation.success import TrialsConfig, run_task
-from fgtutor.teach.notebooks import budget
+from fgtutor.evaluation.tasks import Task
 
 count = budget(fast=2, full=24, unit="grounds", each=2.0)
 small, who = TrialsConfig(robot="toy", trials=count), ("slopes", "ours")
@@ -198,8 +198,8 @@ print(f"merged in {time.perf_counter() - began:.2f} s; complete: {merged.complet
 print("the same rows again:", merged.rows == results[1].rows)
 
 # %%
-from fgtutor.evaluation.report import Share
-from fgtutor.teach.charts import draw_rates
+from fgtutor.figures.charts import draw_rates
+from fgtutor.statistics import Share
 
 by_policy = {
     name: Share.of(row["outcome"] == "reached" for row in merged.rows if row["policy"] == name)
@@ -230,8 +230,8 @@ draw_rates({name: (s.successes, s.trials) for name, s in by_policy.items()},
 # %%
 import torch
 
-from fgtutor.robots.a1 import A1Env
-from fgtutor.terrain import World
+from fgtutor.robots.a1.env import A1Env
+from fgtutor.world.terrain import World
 
 largest = budget(fast=8, full=10, unit="doublings of the batch", each=1.5)
 world, rates = World([[make_terrain("steps", robot="a1", seed=1)]]), {}
@@ -260,10 +260,10 @@ draw_curves(
 #
 #     fgtutor train --robot a1 --terrain steps --num-envs 4096 --threads 16 --device cuda:0
 #
-# Physics itself sits behind one small class, `fgtutor.robots.physics.Physics`. Whoever writes the
-# same members over a GPU simulator replaces it, and no line of observations, rewards, planning or
-# driving will notice. And several GPUs train one policy through rsl_rl's own `torchrun` path: the
-# Feasibility-Net's gradients are averaged just as the policy's are.
+# Physics itself sits behind one small class, `fgtutor.robots.a1.physics.Physics`. Whoever writes
+# the same members over a GPU simulator replaces it, and no line of observations, rewards, planning
+# or driving will notice. And several GPUs train one policy through rsl_rl's own `torchrun` path:
+# the Feasibility-Net's gradients are averaged just as the policy's are.
 
 # %% [markdown]
 # ## Where you are

@@ -14,8 +14,8 @@
 # %%
 import numpy as np
 
+from fgtutor.course.checks import check, hint, solution
 from fgtutor.directions import STEPS
-from fgtutor.teach.checks import check, hint, solution
 
 # %% [markdown]
 # ## ex01.q1

@@ -12,7 +12,7 @@
 # %%
 import numpy as np
 
-from fgtutor.teach.checks import check, hint, solution
+from fgtutor.course.checks import check, hint, solution
 
 # %% [markdown]
 # ## ex04.q1

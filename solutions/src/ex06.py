@@ -13,8 +13,8 @@
 import networkx
 import numpy as np
 
+from fgtutor.course.checks import check, hint, solution
 from fgtutor.directions import STEPS
-from fgtutor.teach.checks import check, hint, solution
 
 # %% [markdown]
 # ## ex06.q1

@@ -11,7 +11,7 @@
 # %%
 import numpy as np
 
-from fgtutor.teach.checks import check, hint, solution
+from fgtutor.course.checks import check, hint, solution
 
 # %% [markdown]
 # ## ex10.q1

@@ -12,8 +12,8 @@
 # %%
 import numpy as np
 
+from fgtutor.course.checks import check, hint, solution
 from fgtutor.directions import STEP_LENGTHS
-from fgtutor.teach.checks import check, hint, solution
 
 # %% [markdown]
 # ## ex11.q1

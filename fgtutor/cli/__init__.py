@@ -1,0 +1,1 @@
+"""The commands beside training, evaluation and the course."""

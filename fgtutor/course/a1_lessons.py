@@ -1,0 +1,297 @@
+"""What the A1's half of the course draws and drives beside maps and routes (see `lessons`).
+
+Reads states, forces, rewards, point clouds and routes; gives pictures, each of one object, and a
+few helpers that keep a lesson's cells short. MuJoCo draws the robot where a graphics library works;
+where none does, stick figures take its place, so that every lesson runs everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from numpy.typing import ArrayLike
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from fgtutor.baselines import View, find_route, without_ood
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError, RenderingError
+from fgtutor.execution import Episode, FollowConfig, execute_batch
+from fgtutor.figures.a1_film import BESIDE, DISTANCE, VIEW
+from fgtutor.figures.canvas import TITLE, Panels, Picture
+from fgtutor.figures.charts import INK, LINES, colours_of
+from fgtutor.figures.maps import GROUND
+from fgtutor.figures.videos import film_strip
+from fgtutor.io.validation import Positive, check_arguments
+from fgtutor.robots.a1.looks import a1_scene
+from fgtutor.robots.a1.model import CALF_LENGTH, HIP_OFFSET, LEG_X, LEG_Y, LEGS, THIGH_LENGTH
+from fgtutor.robots.base import LocomotionEnv
+from fgtutor.robots.offscreen import Renderer, Shot
+from fgtutor.routes import Route
+from fgtutor.specialist import Specialist
+from fgtutor.world.terrain import Terrain
+
+LEG_COLOURS = dict(zip(LEGS, LINES, strict=False))
+"""Each leg has one colour in the stick figures and in the gait."""
+LOADED = 10.0
+"""A foot that the ground pushes with more than this stands, N."""
+STEEPNESS = 25.0
+"""How far down the camera looks, degrees."""
+HARDLY = 1e-9
+"""As good as no lower limit on feasibility: f is a sigmoid, and never quite 0."""
+DOTS = 3_000
+"""Points of a cloud that are drawn at most: more would only cover each other."""
+PAGE = 840
+"""Widest film strip, pixels: a notebook is no wider, and must stay small."""
+
+
+# The robot ----------------------------------------------------------------------------------------
+
+
+def leg_points(qpos: ArrayLike) -> Float[np.ndarray, "4 4 3"]:
+    """Return where each leg's abduction axis, hip, knee and foot are, m; legs as in `LEGS`.
+
+    `qpos` is the state that MuJoCo and `A1Env.drawing` give: place, quaternion, 12 joint angles.
+    """
+    state = np.asarray(qpos, dtype=float)
+    trunk = Rotation.from_quat(state[3:7], scalar_first=True)
+    legs = np.empty((4, 4, 3))
+    for leg, name in enumerate(LEGS):
+        x, y = (1 if name[0] == "F" else -1), (1 if name[1] == "L" else -1)
+        abduction, hip, knee = state[7 + 3 * leg : 10 + 3 * leg]
+        # Hip and knee turn about y: a link that hangs down swings back by a positive angle.
+        thigh = -THIGH_LENGTH * np.array((np.sin(hip), 0.0, np.cos(hip)))
+        calf = -CALF_LENGTH * np.array((np.sin(hip + knee), 0.0, np.cos(hip + knee)))
+        joint = np.array((0.0, y * HIP_OFFSET, 0.0))
+        chain = np.array((0 * joint, joint, joint + thigh, joint + thigh + calf))
+        axis = np.array((x * LEG_X, y * LEG_Y, 0.0))
+        swung = Rotation.from_euler("x", abduction).apply(chain)
+        legs[leg] = state[:3] + trunk.apply(axis + swung)
+    return legs
+
+
+def draw_postures(postures: Mapping[str, ArrayLike], *, title: str = "") -> Picture:
+    """Draw states of the A1 as stick figures: from its right side above, from the front below."""
+    columns = max(1, len(postures))
+    width = min(2.6 * columns, 7.6)
+    figure = Picture(max(width, 3.0), 2 * 0.6 * width / columns + 1.0)
+    panels = figure.subplots(2, columns, squeeze=False, sharey=True)
+    for column, (name, qpos) in enumerate(postures.items()):
+        state = np.asarray(qpos, dtype=float)
+        yaw = Rotation.from_quat(state[3:7], scalar_first=True).as_euler("ZYX")[0]
+        ahead = Rotation.from_euler("z", -yaw)
+        legs = ahead.apply((leg_points(state) - state[:3]).reshape(-1, 3)).reshape(4, 4, 3)
+        # Who stands before it and looks at its face has the robot's left, +y, on the right.
+        for row, axis in enumerate((0, 1)):
+            axes = panels[row, column]
+            _draw_legs(axes, legs[..., axis], legs[..., 2])
+            axes.set(xlim=(-0.42, 0.42), ylim=(-0.38, 0.12), aspect="equal")
+            axes.set(xticks=(), yticks=())
+        panels[0, column].set_title(name, fontsize=9, loc="left")
+    panels[0, 0].set_ylabel("from its right", fontsize=9)
+    panels[1, 0].set_ylabel("from the front", fontsize=9)
+    for leg, colour in LEG_COLOURS.items():
+        panels[0, 0].plot([], [], color=colour, label=leg)
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    figure.suptitle(title, **TITLE, x=0.01)
+    return figure
+
+
+def _draw_legs(axes, across: Float[np.ndarray, "4 4"], up: Float[np.ndarray, "4 4"]) -> None:
+    """Draw trunk and legs as lines in one plane."""
+    hull = [0, 1, 3, 2, 0]  # around the trunk: FR, FL, RL, RR
+    axes.plot(across[hull, 0], up[hull, 0], color=INK, linewidth=4, solid_joinstyle="round")
+    for leg, colour in enumerate(LEG_COLOURS.values()):
+        axes.plot(across[leg], up[leg], ".-", color=colour, linewidth=2.5)
+        axes.plot(across[leg, -1], up[leg, -1], "o", color=INK, markersize=5)
+
+
+def show_walk(
+    episode: Episode, terrain: Terrain, route: Route, *, count: Panels = 6, columns: Panels = 3
+) -> Image.Image | Picture:
+    """Return a film strip of a walk; where nothing draws MuJoCo's scenes, stick figures of it."""
+    check_arguments(show_walk, locals(), ConfigError)
+    try:
+        strip = film_strip(episode, terrain, route, count=count, columns=columns)
+    except RenderingError:
+        print("no graphics library draws here (`fgtutor doctor` says why): stick figures instead")
+        return walk_sticks(episode, count=min(count, 4))
+    strip.thumbnail((PAGE, strip.height))
+    return strip
+
+
+def walk_sticks(episode: Episode, *, count: Panels = 4) -> Picture:
+    """Draw stick figures at `count` moments of a recorded walk, evenly spread."""
+    check_arguments(walk_sticks, locals(), ConfigError)
+    if episode.body is None:
+        raise ConfigError("this episode has no body recorded: drive it with execute()")
+    steps = np.linspace(0, len(episode.poses) - 1, count).astype(int).tolist()
+    dt = episode.seconds / len(episode.poses)
+    postures = {f"{(t + 1) * dt:.1f} s": episode.body[t] for t in steps}
+    return draw_postures(postures, title=f"The walk ({episode.reason})")
+
+
+class A1View:
+    """What `DriveA1` shows of the A1 on a terrain; it draws for as long as it is kept."""
+
+    def __init__(self, terrain: Terrain, colour: str = LINES[0]) -> None:
+        """Prepare the view; `colour` is that of the robot's hull."""
+        self.terrain, self.coat = terrain, to_rgb(colour)
+        self._renderer: Renderer | None = None
+        self._sticks = False
+
+    def __call__(self, env: LocomotionEnv) -> UInt8[np.ndarray, "height width 3"]:
+        """Return a picture of robot 0 of an environment whose first tile is the terrain."""
+        qpos = env.drawing()[0]
+        qpos[:2] -= env.offsets[0, 0].cpu().numpy()
+        yaw = float(env.motion()[0][0, 3])
+        if not self._sticks:
+            try:
+                return self._draw(qpos, yaw)
+            except RenderingError:
+                self._sticks = True
+        canvas = FigureCanvasAgg(draw_postures({"": qpos}))
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3]
+
+    def _draw(self, qpos: np.ndarray, yaw: float) -> UInt8[np.ndarray, "height width 3"]:
+        if self._renderer is None:
+            width, height = VIEW
+            ends = np.array((self.terrain.start, self.terrain.goal))
+            radius = FollowConfig().goal_radius
+            scene = a1_scene(
+                self.terrain, ends, [self.coat], width=width, height=height, goal_radius=radius
+            )
+            self._renderer = Renderer(scene, width, height)
+        x, y, z = qpos[:3].tolist()
+        shot = Shot(
+            qpos=qpos,
+            target=(x, y, z - 0.05),
+            distance=DISTANCE,
+            azimuth=float(np.degrees(yaw)) + BESIDE,
+            elevation=-STEEPNESS,
+            coat=self.coat,
+        )
+        return self._renderer.draw(shot)
+
+    def close(self) -> None:
+        """End the process that draws."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+# What it feels and is paid for --------------------------------------------------------------------
+
+
+def draw_gait(loads: ArrayLike, dt: Positive) -> Picture:
+    """Draw which foot stands when, from the ground's forces on the four feet, [time, 4] in N."""
+    check_arguments(draw_gait, locals(), ConfigError)
+    loaded = np.asarray(loads) > LOADED
+    figure = Picture(7.0, 2.0)
+    axes = figure.subplots()
+    for place, colour in enumerate(LEG_COLOURS.values()):
+        edges = np.flatnonzero(np.diff(loaded[:, place].astype(int), prepend=0, append=0))
+        spans = [(a * dt, (b - a) * dt) for a, b in edges.reshape(-1, 2).tolist()]
+        axes.broken_barh(spans, (place - 0.4, 0.8), color=colour)
+    axes.set_yticks(range(len(LEGS)), LEGS)
+    axes.set(xlabel="time (s)\nA bar: the foot stands", xlim=(0, len(loaded) * dt))
+    axes.invert_yaxis()
+    axes.set_title("Which foot stands when", **TITLE, loc="left")
+    return figure
+
+
+def draw_terms(behaviours: Mapping[str, Mapping[str, float]]) -> Picture:
+    """Draw what each term of the reward pays for each behaviour, and the sum that is paid out."""
+    names = list(next(iter(behaviours.values())))
+    figure = Picture(7.0, 0.9 + 0.42 * (len(names) + 1))
+    axes = figure.subplots()
+    height = 0.8 / len(behaviours)
+    colours = colours_of(behaviours)
+    for number, ((behaviour, terms), colour) in enumerate(
+        zip(behaviours.items(), colours, strict=True)
+    ):
+        values = [terms[name] for name in names]
+        places = np.arange(len(names) + 1) - 0.4 + (number + 0.5) * height
+        axes.barh(places, [*values, sum(values)], height, color=colour, label=behaviour)
+    axes.axvline(0, color=INK, linewidth=1)
+    axes.axhline(len(names) - 0.5, color=INK, linewidth=0.5)
+    axes.set_yticks(range(len(names) + 1), [*names, "sum"], fontsize=9)
+    axes.invert_yaxis()
+    axes.set(xlabel="per second; the sum is floored at zero before it is paid")
+    axes.legend(frameon=False, fontsize=9)
+    axes.set_title("What it earns, term by term", **TITLE, loc="left")
+    return figure
+
+
+# Routes and walks ---------------------------------------------------------------------------------
+
+
+def drive_together(
+    jobs: Sequence[tuple[Route, Terrain, int]],
+    zoo: Mapping[str, Specialist],
+    *,
+    config: FollowConfig | None = None,
+) -> list[Episode]:
+    """Drive (route, terrain, seed) side by side, whatever policies each route was planned with.
+
+    A batch costs hardly more than one walk. Each episode counts policies as its own route does.
+    Terrains must have one size. Raises `ConfigError` if a route names a policy that the zoo lacks.
+    """
+    routes, terrains, seeds = zip(*jobs, strict=True) if jobs else ((), (), ())
+    return execute_batch(routes, terrains, zoo, seeds=seeds, config=config)
+
+
+def daring_route(
+    view: View, start: tuple[float, float], goal: tuple[float, float], *, switch_cost: float = 1.0
+) -> Route:
+    """Return the best route if every f is believed wherever it is asked, however low it is.
+
+    Where ours refuses, this one goes: it shows whether the refusal was wise.
+    """
+    return find_route(without_ood, view, start, goal, f_min=HARDLY, switch_cost=switch_cost)
+
+
+# Clouds -------------------------------------------------------------------------------------------
+
+
+def draw_cloud(
+    points: Float[np.ndarray, "n 3"], *, sensors: ArrayLike | None = None, title: str = ""
+) -> Picture:
+    """Draw a point cloud from above and from the side, coloured by height; crosses are sensors."""
+    shown = np.asarray(points)[:: max(1, -(-len(points) // DOTS))]
+    x, y, z = shown.T
+    figure = Picture(7.2, 4.8)
+    above, side = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.2))
+    reach = max(0.1, float(np.quantile(np.abs(z), 0.999)))
+    style = {"s": 2.0, "cmap": GROUND, "vmin": -reach, "vmax": reach, "linewidths": 0}
+    dots = above.scatter(x, y, c=z, **style)
+    side.scatter(x, z, c=z, **style)
+    if sensors is not None:
+        at = np.atleast_2d(np.asarray(sensors, dtype=float))
+        above.plot(at[:, 0], at[:, 1], "x", color="#D55E00")
+        side.plot(at[:, 0], at[:, 2], "x", color="#D55E00")
+    for axes in (above, side):
+        axes.set_facecolor("#C9CED3")  # level ground is nearly white
+        axes.set_aspect("equal")
+        axes.tick_params(labelsize=8)
+    above.set(ylabel="y (m)")
+    side.set(xlabel=f"x (m)\n{len(points):,} points, from above and from the side", ylabel="z (m)")
+    figure.colorbar(dots, ax=[above, side], shrink=0.8, pad=0.01, label="height (m)")
+    above.set_title(title, **TITLE, loc="left")
+    return figure
+
+
+def difference(scanned: ElevationMap, truth: ElevationMap) -> ElevationMap:
+    """Return by how much a scanned map is too high, m; unknown where the scan is.
+
+    Raises `ConfigError` if the maps do not cover each other.
+    """
+    if scanned.shape != truth.shape or scanned.origin != truth.origin:
+        raise ConfigError(f"need maps of one area, got {scanned} and {truth}")
+    heights = np.where(scanned.known, scanned.heights - truth.heights, np.nan)
+    return ElevationMap(heights, scanned.resolution, scanned.origin)

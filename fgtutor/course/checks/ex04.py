@@ -1,0 +1,203 @@
+"""Exercise 04, "Have I seen this before?": L_recon, w_ood, thresholds (paper, Eqs. 3-5)."""
+
+import numpy as np
+
+from fgtutor.course.checks.question import Mistake, Question
+
+
+def _patches(dice: np.random.Generator) -> tuple:
+    n, points = dice.integers(3, 6), dice.integers(4, 9)
+    patch = dice.normal(0, 0.1, (n, points))
+    return patch, 4 * patch + dice.normal(0, 0.2, (n, points)), float(dice.choice([2.0, 4.0, 5.0]))
+
+
+def _losses(dice: np.random.Generator) -> tuple:
+    low = float(dice.uniform(0.05, 0.5))
+    high = low + float(dice.uniform(0.5, 3.0))
+    return dice.uniform(0, high + 1, (4, 5)), low, high
+
+
+def _weight(loss: np.ndarray, tau_low: float, tau_high: float) -> np.ndarray:
+    return np.interp(loss, (tau_low, tau_high), (1.0, 0.0))
+
+
+def _ceiling(f: float, f_min: float) -> float:
+    return 0.1 + 1.9 * (1 - f_min / f)
+
+
+QUESTIONS = (
+    Question(
+        id="ex04.q1",
+        name="reconstruction_loss",
+        points=2,
+        title="L_recon of a patch",
+        expects="L_recon is one number a patch: the SUM over its points of the squared error, in "
+        "the scaled units that the VAE sees (height_scale * metres).",
+        draw=_patches,
+        truth=lambda patch, decoded, height_scale: np.einsum(
+            "np,np->n", height_scale * patch - decoded, height_scale * patch - decoded
+        ),
+        mistakes=(
+            Mistake(
+                "mean for sum",
+                "the errors are averaged over the points, so tau = 0.1 and 2.0 lose their meaning.",
+                lambda x, y, s: ((s * x - y) ** 2).mean(axis=-1),
+            ),
+            Mistake(
+                "a forgotten scale",
+                "the patch is compared in metres, but the decoder speaks in scaled heights.",
+                lambda x, y, s: ((x - y) ** 2).sum(axis=-1),
+            ),
+            Mistake(
+                "the sum over the wrong axis",
+                "it sums over the patches of the batch; each patch keeps a loss of its own.",
+                lambda x, y, s: ((s * x - y) ** 2).sum(axis=0),
+            ),
+            Mistake(
+                "one number for the whole batch",
+                "it sums over patches too; each patch keeps a loss of its own (axis=-1).",
+                lambda x, y, s: ((s * x - y) ** 2).sum(),
+            ),
+            Mistake(
+                "absolute for squared errors",
+                "the errors are not squared.",
+                lambda x, y, s: np.abs(s * x - y).sum(axis=-1),
+            ),
+            Mistake(
+                "a root too many",
+                "the square root is taken: L_recon is the squared distance itself.",
+                lambda x, y, s: np.sqrt(((s * x - y) ** 2).sum(axis=-1)),
+            ),
+        ),
+        hints=(
+            "Bring both into one unit first: the decoder's output is already scaled.",
+            "A patch is one row: which axis runs over its points?",
+            "((height_scale * patch - decoded) ** 2), summed over the last axis.",
+        ),
+    ),
+    Question(
+        id="ex04.q2",
+        name="ood_weight",
+        points=3,
+        title="the weight w_ood",
+        expects="w_ood is 1 up to tau_low, 0 from tau_high on, and falls linearly between.",
+        draw=_losses,
+        examples=((np.array([0.0, 0.1, 1.05, 2.0, 50.0]), 0.1, 2.0),),
+        truth=_weight,
+        mistakes=(
+            Mistake(
+                "swapped taus, or a forgotten '1 -' (both come to the same)",
+                "it grows with the loss, so that unknown terrain gets the weight 1.",
+                lambda loss, low, high: np.clip((loss - low) / (high - low), 0, 1),
+            ),
+            Mistake(
+                "a forgotten clip",
+                "below tau_low it exceeds 1, and above tau_high it is negative.",
+                lambda loss, low, high: 1 - (loss - low) / (high - low),
+            ),
+            Mistake(
+                "half a clip",
+                "it stops at 0, but below tau_low it exceeds 1.",
+                lambda loss, low, high: np.maximum(1 - (loss - low) / (high - low), 0),
+            ),
+            Mistake(
+                "a hard threshold",
+                "it jumps from 1 to 0 at tau_high; between the taus it should fall gradually.",
+                lambda loss, low, high: np.where(loss < high, 1.0, 0.0),
+            ),
+            Mistake(
+                "division by tau_high alone",
+                "the ramp must span tau_high - tau_low, so that it reaches 0 at tau_high.",
+                lambda loss, low, high: np.clip(1 - (loss - low) / high, 0, 1),
+            ),
+        ),
+        hints=(
+            "What should a loss of exactly tau_low give, and exactly tau_high?",
+            "(loss - tau_low) / (tau_high - tau_low) runs from 0 to 1 between the two.",
+            "np.clip keeps what lies beyond the ends at 0 and 1.",
+        ),
+    ),
+    Question(
+        id="ex04.q3",
+        name="calibrated_taus",
+        points=2,
+        title="thresholds from a specialist's own terrain",
+        expects="tau_low is the 90 % and tau_high twice the 99 % quantile of the own L_recon.",
+        draw=lambda dice: (dice.lognormal(-1, 0.8, dice.integers(60, 200)),),
+        truth=lambda losses: tuple(np.quantile(losses, (0.9, 0.99)) * (1, 2)),
+        mistakes=(
+            Mistake(
+                "the wrong tail",
+                "q10 and q5 are losses of the MOST familiar patches.",
+                lambda losses: tuple(np.quantile(losses, (0.1, 0.05)) * (1, 2)),
+            ),
+            Mistake(
+                "swapped taus",
+                "tau_low comes first and is the smaller one.",
+                lambda losses: tuple(np.quantile(losses, (0.99, 0.9)) * (2, 1)),
+            ),
+            Mistake(
+                "a forgotten factor",
+                "tau_high is TWICE the 99 % quantile: no hundredth of the own terrain closes.",
+                lambda losses: tuple(np.quantile(losses, (0.9, 0.99))),
+            ),
+            Mistake(
+                "shares of the largest loss",
+                "0.9 * max is no quantile: one odd patch would move both thresholds.",
+                lambda losses: (0.9 * losses.max(), 2 * 0.99 * losses.max()),
+            ),
+            Mistake(
+                "percent for shares",
+                "np.percentile counts to 100, np.quantile to 1.",
+                lambda losses: tuple(np.percentile(losses, (0.9, 0.99)) * (1, 2)),
+            ),
+            Mistake(
+                "mean and standard deviation",
+                "losses are far from normal: use quantiles.",
+                lambda losses: (losses.mean() + losses.std(), losses.mean() + 2 * losses.std()),
+            ),
+        ),
+        hints=(
+            "Nine tenths of the own patches should keep full weight.",
+            "np.quantile(losses, 0.9) is the loss that nine tenths stay below.",
+        ),
+        rtol=1e-3,
+    ),
+    Question(
+        id="ex04.q4",
+        name="largest_loss",
+        points=2,
+        title="when does a good place close?",
+        expects="the L_recon at which F = w_ood * f has fallen to f_min = 0.1, where f = 0.9 and "
+        "the "
+        "taus are the paper's 0.1 and 2.0.",
+        truth=lambda: _ceiling(0.9, 0.1),
+        mistakes=(
+            Mistake(
+                "tau_high itself",
+                "there w_ood is 0; the place closes before, as soon as w_ood * f < f_min.",
+                lambda: 2.0,
+            ),
+            Mistake(
+                "a forgotten f",
+                "w_ood need not fall to 0.1, only to 0.1 / f.",
+                lambda: _ceiling(1.0, 0.1),
+            ),
+            Mistake(
+                "the ramp read backwards",
+                "that is where w_ood has fallen BY 1/9, not TO 1/9.",
+                lambda: 0.1 + 1.9 / 9,
+            ),
+            Mistake(
+                "a ramp that starts at 0",
+                "w_ood begins to fall at tau_low = 0.1: add it.",
+                lambda: 1.9 * (1 - 1 / 9),
+            ),
+        ),
+        hints=(
+            "Which w_ood makes w_ood * 0.9 = 0.1?",
+            "Solve 1 - (L - 0.1) / 1.9 = 1/9 for L.",
+        ),
+        rtol=5e-3,
+    ),
+)

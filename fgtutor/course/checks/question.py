@@ -1,0 +1,226 @@
+"""A question: what it asks, how answers are judged, and what a wrong one most likely got wrong.
+
+Reads a learner's answers; gives a `Verdict` that states the property the answer must have, names
+the mistake if it is a known one, and shows where it differs. A typical mistake is kept as the wrong
+function itself: who gives its answers has made it.
+"""
+
+import copy
+import inspect
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from annotated_types import Interval
+
+from fgtutor.course.grading.asking import CRASHED, NOT_STARTED, TOO_SLOW
+from fgtutor.course.grading.values import decode, describe, difference
+from fgtutor.errors import ConfigError
+from fgtutor.io.validation import CountOrZero, Seed, check_arguments, parse_record
+
+PASSED, WRONG = "passed", "wrong"
+OUTCOMES: tuple[str, ...] = (PASSED, NOT_STARTED, WRONG, CRASHED, TOO_SLOW)
+LONGEST = 5000
+"""Most characters of a text that is shown; no path is longer."""
+CASES = 10
+"""Drawn cases of a question, unless the instructor wants more."""
+Cases = Annotated[int, Interval(ge=1, le=10_000)]
+"""How many cases are drawn; with none, any answer would be right."""
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A typical wrong answer."""
+
+    name: str
+    """What went wrong, in a few words: "swapped taus"."""
+    says: str
+    """What tells the learner so: a sentence."""
+    answer: Callable[..., Any]
+    """The wrong function, called as the right one is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """One small function to write, or one number to find."""
+
+    id: str
+    """Such as "ex04.q2"."""
+    name: str
+    """The function or variable that the learner defines."""
+    points: int
+    """What it is worth."""
+    title: str
+    """What it asks for, a few words."""
+    expects: str
+    """The property that a right answer has: a sentence or two."""
+    truth: Callable[..., Any]
+    """A right answer, written otherwise than the worked solution where there is another way."""
+    draw: Callable[[np.random.Generator], tuple] | None = None
+    """Draws the arguments of one case; None for a number to find."""
+    examples: tuple[tuple, ...] = ()
+    """Cases that are always tried, before the drawn ones: edges that a draw may miss."""
+    mistakes: tuple[Mistake, ...]
+    """What learners typically do wrong; the first that fits is named."""
+    hints: tuple[str, ...]
+    """Hints, from a nudge to nearly the answer."""
+    rtol: float = 1e-5
+    """Relative tolerance of an answer."""
+    atol: float = 1e-8
+    """Absolute tolerance of an answer."""
+
+    @property
+    def call(self) -> str:
+        """How the function is called: its name with its parameters."""
+        if self.draw is None:
+            return self.name
+        return f"{self.name}({', '.join(inspect.signature(self.truth).parameters)})"
+
+    def cases(self, seed: Seed = 0, cases: Cases = CASES) -> list[tuple] | None:
+        """Return the arguments of every case; the same for one seed. None for a number to find.
+
+        Raises:
+            ConfigError: Nothing, or more than makes sense, would be drawn, or the seed is none.
+        """
+        check_arguments(Question.cases, locals(), ConfigError)
+        if self.draw is None:
+            return None
+        rng = np.random.default_rng((seed, zlib.crc32(self.id.encode())))
+        return [*self.examples, *(self.draw(rng) for _ in range(cases))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reply:
+    """What `asking.ask` gives, and what a submission may forge."""
+
+    question: str = ""
+    """Its id, where several are asked."""
+    outcome: Literal["not started", "crashed", "too slow"] | None = None
+    """Why there are no answers."""
+    detail: str = ""
+    """The same in words."""
+    changed: CountOrZero | None = None
+    """Which of its arguments the function changed."""
+    answers: list[Any] | None = None
+    """An encoded answer to every case."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of one answer."""
+
+    question: Question
+    """What was asked."""
+    outcome: str
+    """passed | not started | wrong | crashed | too slow"""
+    detail: str = ""
+    """Why, over one or more lines."""
+
+    @property
+    def points(self) -> int:
+        """Points earned."""
+        return self.question.points if self.outcome == PASSED else 0
+
+    def __repr__(self) -> str:
+        """Read as a sentence, for a notebook cell's last line."""
+        head = f"{self.question.id} {self.question.title}: {self.outcome}"
+        return f"{head}\n{self.detail}" if self.detail else head
+
+
+class Judge:
+    """Judges answers to one question over fixed cases, whose right answers are worked out once."""
+
+    def __init__(self, question: Question, cases: Sequence[tuple] | None) -> None:
+        self.question, self.cases = question, cases
+        self.right = answers_of(question.truth, cases)
+
+    def judge(self, reply: Mapping[str, Any]) -> Verdict:
+        """Turn a reply of `asking.ask`, which may be forged or broken, into a verdict."""
+        try:
+            said = parse_record(Reply, reply, ConfigError, "the reply")
+            answers = [decode(answer) for answer in said.answers or []]
+        except ConfigError as error:
+            return Verdict(self.question, CRASHED, plain_text(f"unreadable answer: {error}"))
+        if said.outcome:
+            return Verdict(self.question, said.outcome, plain_text(said.detail))
+        if said.changed is not None:
+            return Verdict(self.question, WRONG, self._changed(said.changed))
+        if len(answers) != len(self.right):
+            return Verdict(self.question, CRASHED, f"{len(answers)} answers to {len(self.right)}")
+        for number, (expected, got) in enumerate(zip(self.right, answers, strict=True)):
+            if text := self._difference(expected, got):
+                return Verdict(self.question, WRONG, self._wrong(number, text, answers))
+        return Verdict(self.question, PASSED)
+
+    def _difference(self, expected: Any, got: Any) -> str:
+        asked = self.question
+        # Where a number is to be found, the message must not tell it.
+        shown = asked.draw is not None
+        return difference(expected, got, rtol=asked.rtol, atol=asked.atol, show=shown)
+
+    def _wrong(self, number: int, text: str, answers: Sequence[Any]) -> str:
+        lines = [f"Expected: {self.question.expects}"]
+        mistake = self._recognise(answers)
+        if mistake:
+            lines.append(f"Looks like {mistake.name}: {mistake.says}")
+        if self.cases is not None:
+            names = inspect.signature(self.question.truth).parameters
+            given = ", ".join(
+                f"{name} = {_short(value)}"
+                for name, value in zip(names, self.cases[number], strict=True)
+            )
+            lines.append(f"In case {number + 1} of {len(self.cases)}, with {given}:")
+        return plain_text("\n".join([*lines, text]))
+
+    def _changed(self, place: int) -> str:
+        names = list(inspect.signature(self.question.truth).parameters)
+        name = names[place] if place < len(names) else "?"
+        return (
+            f"Expected: {self.question.expects}\n"
+            f"The function changes its argument `{name}`, which belongs to the caller: work on a "
+            f"copy, `{name} = {name}.copy()`."
+        )
+
+    def _recognise(self, answers: Sequence[Any]) -> Mistake | None:
+        """Return the first typical mistake whose answers are these in every case."""
+        for mistake in self.question.mistakes:
+            try:
+                wrong = answers_of(mistake.answer, self.cases)
+            except (ArithmeticError, LookupError, ValueError):
+                continue  # a mistake may not fit every case
+            if not any(self._difference(a, b) for a, b in zip(wrong, answers, strict=True)):
+                return mistake
+        return None
+
+
+def answers_of(function: Callable[..., Any], cases: Sequence[tuple] | None) -> list[Any]:
+    """Return what a function answers to each case, without letting it touch the cases."""
+    with np.errstate(all="ignore"):
+        if cases is None:
+            return [function()]
+        return [function(*copy.deepcopy(arguments)) for arguments in cases]
+
+
+def plain_text(text: Any, *, kept: str = "\n\\") -> str:
+    """Return text in which all that cannot be seen, or turns others around, is escaped.
+
+    So a name or a message cannot pass for something else on a terminal or in a file.
+    """
+    return "".join(
+        c if c in kept or (c.isprintable() and c != "\\") else c.encode("unicode_escape").decode()
+        for c in str(text)[:LONGEST]
+    )
+
+
+def plain_name(name: Any) -> str:
+    """Return a path or name in one line as `plain_text`, so that no two of them look the same."""
+    return plain_text(name, kept="")
+
+
+def _short(value: Any) -> str:
+    """Return an argument as a message can show it: whole if small, else what it is."""
+    if isinstance(value, np.ndarray) and value.size <= 8:
+        return np.array2string(value, precision=4, separator=", ").replace("\n", "")
+    return describe(value).removeprefix("the number ").removeprefix("the text ")

@@ -1,0 +1,129 @@
+"""The process of one submission: run its cells, ask its functions, send back plain values.
+
+Reads a job as JSON from stdin; gives one JSON line a question on stdout. Started by `sandbox`, with
+nothing inherited. What it sends is not trusted by anyone: no verdict is made here.
+"""
+
+import importlib
+import json
+import linecache
+import os
+import re
+import sys
+import time
+import types
+from typing import Any, BinaryIO
+
+from fgtutor.course.grading.asking import (
+    CRASHED,
+    NOT_STARTED,
+    TOO_SLOW,
+    TooSlow,
+    ask,
+    explain,
+    time_limit,
+)
+from fgtutor.course.grading.cells import Cells
+from fgtutor.course.grading.confinement import confine
+from fgtutor.course.grading.values import decode
+
+OFFERED = ("fgtutor.directions",)
+"""Modules of ours that a submission may import; they load neither torch nor a simulator."""
+
+
+def main() -> None:
+    """Do the job on stdin, then leave without running anything that the submission left behind."""
+    job = json.loads(sys.stdin.buffer.read())
+    answers = os.fdopen(os.dup(1), "wb")
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(null, stream)
+    for name in OFFERED:  # before the door closes
+        importlib.import_module(name)
+    sys.path.remove(sys.argv.pop())
+    in_force = confine(
+        grader=job["grader"], memory_mb=job["memory_mb"], cpu_seconds=job["cpu_seconds"]
+    )
+    send(answers, {"confined": in_force})
+    namespace, faults = load(job["cells"], job["loading"])
+    send(answers, {"loaded": True})
+    for question in job["questions"]:
+        cases = question["cases"]
+        arguments = None if cases is None else [decode(case) for case in cases]
+        reply = answer(namespace, faults, question["name"], arguments, job["seconds"])
+        if not send(answers, {"question": question["id"], **reply}, job["longest_line"]):
+            detail = "the answers together are larger than any should be"
+            send(answers, {"question": question["id"], "outcome": CRASHED, "detail": detail})
+    os._exit(0)
+
+
+def send(answers: BinaryIO, message: dict[str, Any], longest: int = 10**6) -> bool:
+    """Write one line, unless it is longer than the grader reads; return whether it was written."""
+    line = json.dumps(message).encode() + b"\n"
+    if len(line) <= longest:
+        answers.write(line)
+        answers.flush()
+    return len(line) <= longest
+
+
+def load(cells: list[str], seconds: float) -> tuple[dict[str, Any], list[tuple[str, dict]]]:
+    """Run all cells in order; return what they define, and (source, reply) of each that failed.
+
+    A failing cell does not stop the others, as in a notebook. All share `seconds` of CPU time.
+    """
+    stub_checks()
+    module = types.ModuleType("__main__")
+    module.__dict__["display"] = lambda *values, **options: None
+    sys.modules["__main__"] = module
+    notebook = Cells(module.__dict__)
+    faults = []
+    left = seconds
+    for number, source in enumerate(cells):
+        name = f"<cell {number + 1}>"
+        linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
+        begun = time.process_time()
+        try:
+            code = notebook.compiled(source, name)
+            begun = time.process_time()  # that IPython is loaded for it is not the cell's time
+            with time_limit(max(left, 0.2), patience=0):
+                notebook.run(code)
+        except TooSlow:
+            detail = f"cell {number + 1} runs on and on, and was stopped"
+            faults.append((source, {"outcome": TOO_SLOW, "detail": detail}))
+        except BaseException as error:
+            detail = f"cell {number + 1}: {explain(error, name)}"
+            faults.append((source, {"outcome": CRASHED, "detail": detail}))
+        left -= time.process_time() - begun
+    return module.__dict__, faults
+
+
+def stub_checks() -> None:
+    """Offer `check`, `hint` and `solution` that do nothing: a submission is asked from outside."""
+    checks = types.ModuleType("fgtutor.course.checks")
+    for name in ("check", "hint", "solution"):
+        checks.__dict__[name] = lambda *values, **options: None
+    sys.modules["fgtutor.course.checks"] = checks
+
+
+def answer(
+    namespace: dict[str, Any],
+    faults: list[tuple[str, dict]],
+    name: str,
+    cases: list[tuple] | None,
+    seconds: float,
+) -> dict[str, Any]:
+    """Ask one question; where the name is missing, say which failing cell should have given it."""
+    if name not in namespace:
+        gives = re.compile(
+            rf"^ *(?:async )?(?:(?:def|class) {name}\b|(?:from|import) .*\b{name}\b"
+            rf"|(?:\w+, *)*{name}\b[^()\n=]*=(?!=))",
+            re.MULTILINE,
+        )
+        for source, reply in faults:
+            if gives.search(source):
+                return reply
+        return {"outcome": NOT_STARTED, "detail": f"the notebook defines no `{name}`"}
+    try:
+        return ask(namespace[name], cases, seconds, patience=0)
+    except BaseException as error:  # whatever a submission raises to get out of here
+        return {"outcome": CRASHED, "detail": type(error).__name__}

@@ -1,0 +1,74 @@
+"""What every picture of the course shares: the canvas, the colours, the way to a file.
+
+Gives `Picture`, a matplotlib figure that a notebook shows by itself and that any thread may draw.
+Nothing here touches pyplot, whose figures are global state.
+"""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from annotated_types import Interval
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from fgtutor.errors import ConfigError
+from fgtutor.io.storage import atomic_write
+from fgtutor.io.validation import check_arguments
+
+POLICY_COLOURS = {
+    "steps": "#0072B2",
+    "gaps": "#D55E00",
+    "slopes": "#009E73",
+    "rubble": "#CC79A7",
+    "bridge": "#E69F00",
+    "valley": "#56B4E9",
+    "general": "#4D4D4D",
+}
+"""A policy has one colour in the whole course: Okabe and Ito's, safe for the colour-blind."""
+OTHER_COLOURS = ("#882255", "#999933", "#332288", "#F0E442")
+"""Policies that the course does not know take these in turn: Paul Tol's muted ones and a yellow."""
+TITLE = {"fontsize": 10.5, "weight": "bold", "ha": "left"}
+"""How titles look."""
+Panels = Annotated[int, Interval(ge=1, le=1000)]
+"""A number of pictures, in all or side by side."""
+Dpi = Annotated[float, Interval(ge=1, le=2400)]
+"""Dots per inch."""
+
+
+class Picture(Figure):
+    """A figure without screen or pyplot that a notebook shows when it is a cell's last value."""
+
+    def __init__(self, width: float = 7.0, height: float = 5.0) -> None:
+        super().__init__(figsize=(width, height), layout="constrained", dpi=100)
+        FigureCanvasAgg(self)
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png")
+        return buffer.getvalue()
+
+
+def save_figure(figure: Figure, path: str | Path, dpi: Dpi = 120) -> Path:
+    """Write a figure whole or not at all; the suffix chooses the format (.png, .svg, .pdf ...).
+
+    Raises:
+        ConfigError: The suffix is no picture format, or `dpi` no number of dots.
+        StorageError: The system refused to write.
+    """
+    check_arguments(save_figure, locals(), ConfigError)
+    path = Path(path)
+    formats = figure.canvas.get_supported_filetypes()
+    if path.suffix[1:].lower() not in formats:
+        raise ConfigError(f"cannot draw {path.name!r}: give it a suffix of {', '.join(formats)}")
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)
+    return path
+
+
+def policy_colours(names: Sequence[str]) -> dict[str, str]:
+    """Return the colour of each policy; names that the course does not know take a cycle."""
+    strangers = [name for name in names if name not in POLICY_COLOURS]
+    others = {name: OTHER_COLOURS[i % len(OTHER_COLOURS)] for i, name in enumerate(strangers)}
+    return {name: POLICY_COLOURS.get(name) or others[name] for name in names}

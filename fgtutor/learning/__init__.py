@@ -1,0 +1,1 @@
+"""Training: its settings, PPO with the Feasibility-Net, checkpoints, several processes."""

@@ -1,0 +1,184 @@
+"""PPO that fits the Feasibility-Net on the way: one rollout, two losses, no shared weight.
+
+Reads rsl_rl's rollout storage, whose `tracking` group tells what happened after every step; gives
+labels for each patch and an algorithm that trains policy and Feasibility-Net side by side, and the
+context encoder of a blind policy.
+Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from rsl_rl.algorithms import PPO
+from rsl_rl.utils import reduce_gradients_in_buckets
+from torch import Tensor, nn
+
+from fgtutor.feasibility import FeasibilityNet
+from fgtutor.policies.dreamwaq import ContextNet, DreamWaQModel
+
+QUANTILES = (0.5, 0.9, 0.95, 0.99)
+"""Quantiles of L_recon that a specialist stores, for calibrated taus."""
+
+
+def feasibility_labels(
+    tracking: Float[Tensor, "time envs 3"], window: int
+) -> tuple[Float[Tensor, "time envs"], Bool[Tensor, "time envs"]]:
+    """Return the mean r_v over the next `window` steps, and where that mean is trustworthy.
+
+    `tracking[t]` holds (r_v, failed, ended) of the step that led to time t. A failure makes
+    the rest of its window zero; a time-out cuts it short; no label reaches into the next episode.
+    A label counts if at least half of its window was seen. `window` 0 means 1, the paper's label.
+
+    `failed` between 0 and 1 is a failure that reaches back over that share of the window only: who
+    is further away from it does not know of it, as with a time-out.
+    """
+    window = max(window, 1)
+    steps = tracking.shape[0]
+    total = torch.zeros_like(tracking[..., 0])
+    seen = torch.zeros_like(total)
+    running = torch.ones_like(total, dtype=torch.bool)
+    reach = torch.zeros_like(total)
+    for ahead in range(1, min(window, steps - 1) + 1):
+        r_v, failed, ended = tracking[ahead:].unbind(-1)
+        now = running[:-ahead]
+        total[:-ahead] += r_v * now
+        seen[:-ahead] += now
+        reach[:-ahead] += window * failed * now
+        running[:-ahead] = now & (ended == 0)
+        running[-ahead:] = False
+    # Steps of a failed episode that never happened still count, as zeros.
+    return total / seen.maximum(reach).clamp(min=1), (seen >= (window + 1) // 2) | (reach > 0)
+
+
+class FeasibilityPPO(PPO):
+    """rsl_rl's PPO that also fits the Feasibility-Net to each rollout before it learns from it.
+
+    The two share data and nothing else: separate networks, optimisers and losses. A blind policy's
+    context encoder is fitted in the same way, to its own loss.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        label_steps: int,
+        feasibility_learning_rate: float,
+        feasibility_batch: int,
+        feasibility_updates: int,
+        context_learning_rate: float,
+        context_batch: int,
+        context_updates: int,
+        **kwargs: Any,
+    ) -> None:
+        """Add a Feasibility-Net sized by the `patch` group to what PPO builds."""
+        super().__init__(*args, **kwargs)
+        num_points = self.storage.observations["patch"].shape[-1]
+        self.feasibility = FeasibilityNet(num_points).to(self.device)
+        self.feasibility_optimizer = torch.optim.Adam(
+            self.feasibility.parameters(), lr=feasibility_learning_rate
+        )
+        self.label_steps = label_steps
+        self.feasibility_batch, self.feasibility_updates = feasibility_batch, feasibility_updates
+        policy = self.get_policy()
+        self.context = policy.context if isinstance(policy, DreamWaQModel) else None
+        if self.context:
+            self.context_optimizer = torch.optim.Adam(
+                self.context.parameters(), lr=context_learning_rate
+            )
+        self.context_batch, self.context_updates = context_batch, context_updates
+        self.metrics: dict[str, float] = {}
+        self.memory: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def update(self) -> dict[str, float]:
+        """Fit the Feasibility-Net, then update the policy (which empties the storage).
+
+        The context encoder comes last: what PPO compares are policies on the same context.
+        """
+        r_v, failed, ended = self.storage.observations["tracking"].unbind(-1)
+        self.metrics = {
+            "reward": self.storage.rewards.mean().item(),
+            "r_v": r_v.mean().item(),
+            "failed": (failed == 1).sum().item() / max(1.0, ended.sum().item()),
+        }
+        self.metrics |= self.fit_feasibility()
+        samples = self.context.samples(self.storage.observations) if self.context else None
+        self.metrics |= super().update()
+        # While only the critic learns, nothing of the policy may change.
+        if self.context and samples and next(self.context.parameters()).requires_grad:
+            self.metrics |= self.fit_context(self.context, *samples)
+        return self.metrics
+
+    def fit_context(
+        self, context: ContextNet, history: Tensor, velocity: Tensor, following: Tensor
+    ) -> dict[str, float]:
+        """Fit the context encoder to the samples of one rollout; return the mean loss parts."""
+        sums: dict[str, float] = {}
+        shape = (self.context_updates, self.context_batch)
+        for batch in torch.randint(len(history), shape, device=history.device):
+            loss, parts = context.loss(history[batch], velocity[batch], following[batch])
+            self._descend(loss, context, self.context_optimizer)
+            for name, value in parts.items():
+                sums[name] = sums.get(name, 0.0) + value.item() / self.context_updates
+        return {f"context_{name}": value for name, value in sums.items()}
+
+    def fit_feasibility(self) -> dict[str, float]:
+        """Fit the net to the labelled patches at hand; return the mean of each loss part.
+
+        These are the rollouts since the last checkpoint: neighbours in one rollout are too alike to
+        learn from one rollout at a time, and labels of long ago describe another policy.
+        """
+        observations = self.storage.observations
+        label, valid = feasibility_labels(observations["tracking"], self.label_steps)
+        self.memory.append(
+            (observations["patch"][valid], observations["command"][valid], label[valid])
+        )
+        patch, command, label = (torch.cat(parts) for parts in zip(*self.memory, strict=True))
+        sums: dict[str, float] = {}
+        shape = (self.feasibility_updates, self.feasibility_batch)
+        batches = torch.randint(len(label), shape, device=label.device)
+        for batch in batches:
+            loss, parts = self.feasibility.loss(patch[batch], command[batch], label[batch])
+            self._descend(loss, self.feasibility, self.feasibility_optimizer)
+            for name, value in parts.items():
+                sums[name] = sums.get(name, 0.0) + value.item() / len(batches)
+        with torch.no_grad():
+            sample = patch[batches[:8].flatten()]
+            reconstruction = self.feasibility.reconstruction(sample)
+        levels = torch.tensor(QUANTILES, device=reconstruction.device)
+        quantiles = torch.quantile(reconstruction, levels).tolist()
+        losses = {f"feasibility_{name}": value for name, value in sums.items()}
+        return losses | {f"L_recon_{q}": v for q, v in zip(QUANTILES, quantiles, strict=True)}
+
+    def _descend(self, loss: Tensor, net: nn.Module, optimizer: torch.optim.Optimizer) -> None:
+        """Take one step down the loss, along the mean gradient of all processes."""
+        optimizer.zero_grad()
+        loss.backward()
+        if self.is_multi_gpu:
+            reduce_gradients_in_buckets(
+                net.parameters(), self.gpu_world_size, self.grad_reduce_bucket_mb
+            )
+        optimizer.step()
+
+    def broadcast_parameters(self) -> None:
+        """Copy all networks from the first process to the others."""
+        super().broadcast_parameters()
+        for tensor in self.feasibility.state_dict().values():
+            torch.distributed.broadcast(tensor, src=0)
+
+    def save(self) -> dict:
+        """Return the state of all networks and optimisers."""
+        state = super().save() | {
+            "feasibility_state_dict": self.feasibility.state_dict(),
+            "feasibility_optimizer_state_dict": self.feasibility_optimizer.state_dict(),
+        }
+        if self.context:
+            state["context_optimizer_state_dict"] = self.context_optimizer.state_dict()
+        return state
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
+        """Take over the state that `save` returned."""
+        self.feasibility.load_state_dict(loaded_dict["feasibility_state_dict"], strict=strict)
+        self.feasibility_optimizer.load_state_dict(loaded_dict["feasibility_optimizer_state_dict"])
+        if self.context:
+            self.context_optimizer.load_state_dict(loaded_dict["context_optimizer_state_dict"])
+        return super().load(loaded_dict, load_cfg, strict)

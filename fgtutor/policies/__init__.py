@@ -1,0 +1,1 @@
+"""Policy networks: how they are described, their symmetry, and the blind DreamWaQ policy."""

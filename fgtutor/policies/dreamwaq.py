@@ -1,0 +1,230 @@
+"""DreamWaQ, the paper's training protocol: a policy without eyes that imagines what it walks on.
+
+Reads the last few frames of what a blind robot feels. A context encoder estimates from them the
+body's velocity and a latent that says enough about the ground to predict the next frame; the policy
+acts on the newest frame and both. The critic, needed in training only, may know everything.
+Source: paper, Sec. IV; Nahrendra et al., "DreamWaQ: Learning Robust Quadrupedal Locomotion With
+Implicit Terrain Imagination via Deep Reinforcement Learning", ICRA 2023. Left out: its adaptive
+bootstrapping, which at times shows the policy the true velocity in training.
+"""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from rsl_rl.modules import MLP
+from torch import Tensor, nn
+
+from fgtutor.errors import ConfigError
+from fgtutor.io.validation import Width
+from fgtutor.policies.symmetry import Mirror, SymmetricMLP, SymmetricMLPModel, join
+
+HISTORY = 5
+"""Frames that the policy remembers, the newest included."""
+VELOCITY = 3
+"""How many numbers it estimates of the robot's motion."""
+BETA = 1e-3
+"""Weight of the latent's divergence against squared errors averaged over a frame; ours."""
+
+
+class History:
+    """The last frames of every robot, the newest last; what came before an episode is zero."""
+
+    def __init__(self, steps: int, width: int, num_envs: int, device: str = "cpu") -> None:
+        """Remember nothing yet."""
+        self.frames: Float[Tensor, "envs steps width"]
+        self.frames = torch.zeros(num_envs, steps, width, device=device)
+
+    def forget(self, ids: Int[Tensor, "n"]) -> None:
+        """Begin new episodes for `ids`."""
+        self.frames[ids] = 0.0
+
+    def advance(self) -> None:
+        """Let one control step pass: the oldest frame makes room for the next one."""
+        self.frames = torch.cat((self.frames[:, 1:], self.frames[:, :1]), dim=1)
+
+    def see(self, frame: Float[Tensor, "envs width"]) -> Float[Tensor, "envs flat"]:
+        """Take `frame` for the newest, as often as anybody looks, and return all, oldest first."""
+        self.frames[:, -1] = frame
+        return self.frames.flatten(1).clone()
+
+
+class ContextNet(nn.Module):
+    """The context encoder: from a history to (newest frame, estimated velocity, latent)."""
+
+    def __init__(
+        self,
+        width: int,
+        *,
+        history: int = HISTORY,
+        latent: int = 16,
+        hidden: Sequence[int] = (128, 64),
+        mirror: Mirror | None = None,
+    ) -> None:
+        """Build the encoder and the decoder that it is trained with.
+
+        Args:
+            width: Numbers in a frame.
+            history: Frames in a history.
+            latent: Width of the latent.
+            hidden: Widths of the encoder; the decoder mirrors them.
+            mirror: Left-right symmetry of the encoder, from `mirrors`.
+        """
+        super().__init__()
+        self.width, self.latent = width, latent
+        self.encoder = SymmetricMLP(
+            history * width,
+            VELOCITY + 2 * latent,
+            mirror,
+            hidden_dims=list(hidden),
+            activation="elu",
+        )
+        self.decoder = MLP(VELOCITY + latent, width, list(hidden)[::-1], "elu")
+
+    def forward(self, history: Float[Tensor, "*batch flat"]) -> Float[Tensor, "*batch features"]:
+        """Return what the policy acts on; the latent is its mean, so that acting is repeatable."""
+        estimate = self.encoder(history)[..., : VELOCITY + self.latent]
+        return torch.cat((history[..., -self.width :], estimate), dim=-1)
+
+    def samples(self, rollout: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return (history, true velocity, next frame) of each step not followed by a new episode.
+
+        `rollout` holds observation groups [time, envs, width], as rsl_rl's storage keeps them.
+        """
+        history, velocity = rollout["history"], rollout["critic"][..., :VELOCITY]
+        goes_on = rollout["tracking"][1:, :, 2] == 0
+        following = history[1:, :, -self.width :]
+        return history[:-1][goes_on], velocity[:-1][goes_on], following[goes_on]
+
+    def loss(
+        self,
+        history: Float[Tensor, "batch flat"],
+        velocity: Float[Tensor, "batch 3"],
+        following: Float[Tensor, "batch width"],
+        beta: float = BETA,
+    ) -> tuple[Float[Tensor, ""], dict[str, Float[Tensor, ""]]]:
+        """Return the loss of a beta-VAE that predicts the next frame, and its three parts.
+
+        L = mean (v - v_hat)^2 + mean (o' - o'_hat)^2 + beta KL(q(z | history) || N(0, 1)). In
+        training mode the latent is sampled; in evaluation mode it is the mean.
+        """
+        estimate, mean, log_variance = self.encoder(history).split(
+            (VELOCITY, self.latent, self.latent), dim=-1
+        )
+        latent = mean
+        if self.training:
+            latent = mean + torch.randn_like(mean) * torch.exp(0.5 * log_variance)
+        predicted = self.decoder(torch.cat((estimate, latent), dim=-1))
+        divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)
+        parts = {
+            "velocity": (estimate - velocity).square().mean(),
+            "prediction": (predicted - following).square().mean(),
+            "kl": divergence.mean(),
+        }
+        return parts["velocity"] + parts["prediction"] + beta * parts["kl"], parts
+
+
+class DreamWaQModel(SymmetricMLPModel):
+    """rsl_rl's policy on what a `ContextNet` makes of the `history` group; exports as any other.
+
+    The PPO loss stops at the encoder, which has a loss and an optimiser of its own (see `ppo`).
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        history: Width = HISTORY,
+        latent: Width = 16,
+        context_hidden: tuple[Width, ...] = (128, 64),
+        mirror: Mirror | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Build encoder and policy.
+
+        Args:
+            *args: What rsl_rl passes to every model.
+            history: Frames in the `history` group.
+            latent: Width of the encoder's latent.
+            context_hidden: Widths of the encoder.
+            mirror: How (velocity, frame) and the actions are mirrored; a policy built to be filled
+                with saved weights finds it there.
+            **kwargs: The same as `*args`, by name.
+
+        Raises:
+            ConfigError: The observations are no `history` frames, or the latent cannot be halved.
+        """
+        self.history, self.latent = history, latent
+        seen, acted = mirrors(mirror, history, latent) if mirror else (None, None)
+        super().__init__(*args, mirror=acted, **kwargs)
+        self.options = {"history": history, "latent": latent, "context_hidden": [*context_hidden]}
+        self.context = ContextNet(
+            self.obs_dim // history,
+            history=history,
+            latent=latent,
+            hidden=context_hidden,
+            mirror=seen,
+        )
+
+    def _get_latent_dim(self) -> int:
+        """Return how many numbers the policy's layers read."""
+        if self.history < 1 or self.obs_dim % self.history:
+            raise ConfigError(
+                f"{self.obs_dim} observations are no {self.history} frames of one width: ask the "
+                "environment for as many frames as the policy reads"
+            )
+        return self.obs_dim // self.history + VELOCITY + self.latent
+
+    def get_latent(self, obs: Any, masks: Any = None, hidden_state: Any = None) -> Tensor:
+        """Return newest frame, estimated velocity and latent, without a way back for gradients."""
+        with torch.no_grad():
+            return self.context(super().get_latent(obs, masks, hidden_state))
+
+    def as_jit(self) -> nn.Module:
+        """Return a module for TorchScript: from a history to actions."""
+        return self._with_context(super().as_jit())
+
+    def as_onnx(self, verbose: bool) -> nn.Module:
+        """Return a module for ONNX: from a history to actions."""
+        return self._with_context(super().as_onnx(verbose))
+
+    def _with_context(self, exported: nn.Module) -> nn.Module:
+        """Put the encoder where rsl_rl's exported modules treat their input before the layers."""
+        exported.obs_normalizer = copy.deepcopy(self.context)
+        return exported
+
+
+def mirrors(mirror: Mirror, history: int, latent: int) -> tuple[Mirror, Mirror]:
+    """Return the mirrors of encoder and policy, from that of (velocity, frame) and the actions.
+
+    The mirror image of a latent is the latent with its halves exchanged: with that and an encoder
+    symmetric in itself, estimates and actions are mirrored exactly.
+
+    Raises:
+        ConfigError: The latent cannot be halved.
+    """
+    if latent % 2:
+        raise ConfigError(
+            f"a symmetric latent has two halves, got a width of {latent}: make it even"
+        )
+    index, sign = mirror.observation_index, mirror.observation_sign
+    velocity = (index[:VELOCITY], sign[:VELOCITY])
+    frame = ([i - VELOCITY for i in index[VELOCITY:]], sign[VELOCITY:])
+    halves = ([*range(latent // 2, latent), *range(latent // 2)], [1.0] * latent)
+    frames, policy = join([frame] * history), join([frame, velocity, halves])
+    estimate = join([velocity, halves, halves])
+    return (
+        Mirror(
+            observation_index=frames[0],
+            observation_sign=frames[1],
+            action_index=estimate[0],
+            action_sign=estimate[1],
+        ),
+        Mirror(
+            observation_index=policy[0],
+            observation_sign=policy[1],
+            action_index=mirror.action_index,
+            action_sign=mirror.action_sign,
+        ),
+    )

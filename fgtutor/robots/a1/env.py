@@ -1,0 +1,418 @@
+"""The Unitree A1 behind the same seam as the toy: MuJoCo physics, a trot clock and a height scan.
+
+Reads a `World`; gives a `LocomotionEnv` whose actions are joint targets around the stance, at 50
+Hz. All robots share one MuJoCo model of the world's ground, simulated as a batch (`physics`).
+The recipe (observations, rewards, gains) follows legged_gym (Rudin et al., CoRL 2021) and, for a
+policy that trains on two CPU cores, adds a gait clock and left-right symmetry.
+"""
+
+# MuJoCo's compiled modules carry no type information that pyright could read.
+# pyright: reportAttributeAccessIssue=false
+
+import itertools
+import math
+import warnings
+from dataclasses import fields
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import grey_closing, maximum_filter
+from torch import Tensor
+
+from fgtutor.elevation import ElevationMap
+from fgtutor.patches import PatchGrid, ground_height, rotate, sample_heights
+from fgtutor.robots.a1 import observation
+from fgtutor.robots.a1.model import (
+    FOOT_RADIUS,
+    STANCE,
+    STANCE_HEIGHT,
+    A1Config,
+    build_spec,
+    sensor_slices,
+)
+from fgtutor.robots.a1.observation import (
+    NOISE,
+    SCAN_GRID,
+    SCAN_LIMIT,
+    SCAN_NOISE,
+    SCAN_SCALE,
+)
+from fgtutor.robots.a1.physics import Physics
+from fgtutor.robots.a1.randomise import A1EnvConfig, randomise
+from fgtutor.robots.base import LocomotionEnv
+from fgtutor.robots.commands import EnvConfig
+from fgtutor.world.terrain import World
+
+A1_GRID = PatchGrid(ahead=0.8, behind=0.8, half_width=0.5)
+"""The A1's patch: 17 x 11 points, 1.6 m x 1.0 m."""
+LOOK_GRID = PatchGrid(ahead=0.9, behind=0.8, half_width=0.5)
+"""The patch and the policy's scan (`SCAN_GRID`), sampled at once."""
+FEET = ((0.17, -0.155), (0.17, 0.155), (-0.22, -0.155), (-0.22, 0.155))
+"""Where the feet stand in the stance, in the yaw frame, m; legs in the order of `LEGS`."""
+MAX_SLOPE = 0.6
+"""Steepest ground a robot is tilted to when it is placed; rise over run."""
+MAX_TILT = 1.2
+"""A trunk tilted further than this has fallen, rad."""
+DROP = 0.35
+"""A sole this far below the ground around it has dropped into a hole, m; at the bottom of a valley
+with walls of 50 degrees it is 0.3 m below the ground that is `RIM` away."""
+RIM = 0.25
+"""Half of the widest hole that a foot can drop into while the robot still stands, m."""
+FREE_FALL = 2.0
+"""A trunk that sinks faster than this falls, m/s: a step of 0.2 m would do it, walking never."""
+NOSE = 0.35
+"""How far before its middle a robot that turns at the wrong rate misses its velocity, m."""
+A1_EPISODES = EnvConfig(
+    speed=(0.45, 0.9),
+    max_turn_rate=1.0,
+    episode_seconds=20.0,
+    stuck_seconds=2.5,
+    slowest=0.25,
+    obedience=0.5,
+    start_yaw=1.6,
+    start_beside=0.5,
+    run_up=0.6,
+    traverse_share=0.85,
+    promote_above=0.4,
+    demote_below=0.15,
+)
+"""The A1's commands; the time limit lets the slowest command cross a tile of 8 m."""
+
+
+class A1Env(LocomotionEnv):
+    """A batch of A1s in MuJoCo."""
+
+    num_actions = 12
+    """Joint targets relative to the stance, in the order of `a1_model.JOINTS`."""
+    mirror = observation.mirror()
+    episodes = A1_EPISODES
+    felt, unfelt = observation.FELT, observation.UNFELT
+
+    def __init__(
+        self,
+        world: World,
+        num_envs: int = 1024,
+        *,
+        config: EnvConfig | None = None,
+        settings: A1EnvConfig | None = None,
+        model: A1Config | None = None,
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> None:
+        """Build the model of the world and a batch of robots on it.
+
+        Unless `settings` say otherwise, robots in training are randomised and noisy, others are
+        neither. `threads` default to torch's: one process, one number of cores.
+        """
+        config = config or self.episodes
+        self.settings = settings or A1EnvConfig(randomise=config.train, noise=config.train)
+        self.model = model or A1Config()
+        self.grid = A1_GRID
+        self.control_dt = self.model.timestep * self.settings.substeps
+        super().__init__(world, num_envs, config=config, seed=seed, device=device)
+        compiled = world_spec(world, self.model).compile()
+        self.physics = Physics(compiled, num_envs, threads=threads or torch.get_num_threads())
+        self.sensors = sensor_slices()
+        ground = np.asarray(world.elevation.filled().heights)
+        around = 2 * round(RIM / self.resolution) + 1
+        self.peaks = torch.as_tensor(maximum_filter(ground, 3), device=device).flatten()
+        self.edges = torch.as_tensor(_edges(ground), device=device).flatten()
+        # Closing, unlike a maximum, does not take the foot of a wall for the floor of a hole.
+        rims = grey_closing(np.pad(ground, around, mode="edge"), around)
+        rims = np.ascontiguousarray(rims[around:-around, around:-around])
+        self.rims = torch.as_tensor(rims, device=device).flatten()
+        self.map_shape = ground.shape
+        self.stance = torch.tensor(STANCE, device=device)
+        self.look_points = LOOK_GRID.points.to(device)
+        self.noise, self.scale = (
+            torch.cat([torch.full((row[0],), row[k]) for row in NOISE.values()]).to(device)
+            for k in (1, 2)
+        )
+        self.last_action = torch.zeros(num_envs, 12, device=device)
+        self.action_change = torch.zeros(num_envs, 12, device=device)
+        self.clock = torch.zeros(num_envs, device=device)
+        self.exploded = torch.zeros(num_envs, dtype=torch.bool)
+        self.explosions = 0
+        self.late = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)
+        self.body_seed = seed
+        self._randomise()
+        self.reset_all()
+
+    # Physics ----------------------------------------------------------------------------------
+
+    def _randomise(self) -> None:
+        """Make every simulation another robot on another ground, once for all its episodes."""
+        if self.settings.randomise:
+            self.late = randomise(self.physics, self.settings, self.body_seed).to(self.device)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what training must store to continue, and which robots it had drawn."""
+        return super().state_dict() | {"body_seed": torch.tensor(self.body_seed)}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take over a stored state, with the robots that belong to it."""
+        super().load_state_dict(state)
+        self.body_seed = int(state["body_seed"])
+        self._randomise()
+
+    def rebuild(self) -> None:
+        """Reset every simulation: no contact and no warm start of the past survives."""
+        self.physics.reset()
+        self.physics.forward()
+        self._read()
+
+    def advance(self, actions: Float[Tensor, "envs 12"]) -> None:
+        """Set the joint targets and simulate one control step."""
+        broken = ~torch.isfinite(actions).all(dim=-1)
+        action = torch.where(broken[:, None], 0.0, actions.detach()).to(self.stance)
+        applied = torch.where(self.late, self.last_action, action)
+        self.action_change, self.last_action = action - self.last_action, action
+        target = self.stance + self.settings.action_scale * applied
+        self.physics.ctrl.copy_(target)
+        if self.settings.randomise:
+            self._push()
+        self.physics.step(self.settings.substeps)
+        self.clock = (self.clock + self.settings.gait_frequency * self.control_dt).remainder(1.0)
+        self._read()
+        self._count_explosions(broken.cpu())
+
+    def _push(self) -> None:
+        """Change the velocity of a few robots, as a shove would."""
+        hit = self._uniform(self.num_envs) < self.control_dt / self.settings.push_seconds
+        if hit.any():
+            shove = self.settings.push_speed * (2 * self._uniform(self.num_envs, 2) - 1)
+            self.physics.qvel[:, :2] += (shove * hit[:, None]).double().cpu()
+
+    def _count_explosions(self, broken: Bool[Tensor, "envs"]) -> None:
+        """Mark simulations whose numbers blew up, or whose actions were not numbers, as lost.
+
+        They stay lost until they are placed anew; the others are not touched.
+        """
+        lost = broken
+        lost[self.physics.exploded()] = True
+        new = int((lost & ~self.exploded).sum())
+        self.exploded |= lost
+        if new:
+            self.explosions += new
+            warnings.warn(
+                f"{new} simulations exploded and count as failed ({self.explosions} so far)",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+
+    def _read(self) -> None:
+        """Take the state over from the simulator, with the trunk's rotation worked out."""
+        self.q = self.physics.qpos.to(self.device, torch.float32)
+        self.v = self.physics.qvel.to(self.device, torch.float32)
+        self.sensed = self.physics.sensors.to(self.device, torch.float32)
+        w, x, y, z = self.q[:, 3:7].unbind(-1)
+        # Rows of the rotation matrix: the axes of the world as the trunk sees them.
+        east = torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1)
+        north = torch.stack((2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)), -1)
+        self.up = torch.stack(
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1
+        )
+        vx, vy, vz = self.v[:, :3].T[..., None]
+        self.body_velocity = vx * east + vy * north + vz * self.up
+        yaw = torch.atan2(north[:, 0], east[:, 0])
+        cos, sin = torch.cos(yaw), torch.sin(yaw)
+        vx, vy = vx[:, 0], vy[:, 0]
+        turn = (self.v[:, 3:6] * self.up).sum(-1)
+        self.pose = torch.cat((self.q[:, :3], yaw[:, None]), dim=-1)
+        self.velocity = torch.stack((cos * vx + sin * vy, cos * vy - sin * vx, turn), dim=-1)
+
+    # Places -----------------------------------------------------------------------------------
+
+    def place(self, ids: Int[Tensor, "n"], poses: Float[Tensor, "n 3"]) -> None:
+        """Put robots at rest in their stance, tilted to the ground under their feet."""
+        n = len(ids)
+        feet = torch.tensor(FEET, device=self.device)
+        places = poses[:, None, :2] + rotate(feet, poses[:, 2])
+        under = self._lookup(self.peaks, places)
+        right, left = under[:, 0::2].mean(-1), under[:, 1::2].mean(-1)
+        front, rear = under[:, :2].mean(-1), under[:, 2:].mean(-1)
+        slope_x = ((front - rear) / (FEET[0][0] - FEET[2][0])).clamp(-MAX_SLOPE, MAX_SLOPE)
+        slope_y = ((left - right) / (FEET[1][1] - FEET[0][1])).clamp(-MAX_SLOPE, MAX_SLOPE)
+        # The lowest plane of this slope that keeps all four feet out of the ground.
+        rise = slope_x[:, None] * feet[:, 0] + slope_y[:, None] * feet[:, 1]
+        ground = (under - rise).amax(-1)
+        state = torch.zeros(n, self.physics.model.nq, device=self.device)
+        state[:, :2] = poses[:, :2]
+        steep = (1 + slope_x.square() + slope_y.square()).sqrt()
+        state[:, 2] = ground + steep * STANCE_HEIGHT + 0.01
+        pitch = -torch.atan(slope_x)
+        state[:, 3:7] = _quaternion(torch.atan(slope_y * torch.cos(pitch)), pitch, poses[:, 2])
+        state[:, 7:] = self.stance
+        self.physics.reset(ids)
+        self.physics.qpos[ids] = state.double().cpu()
+        self.physics.forward(ids)
+        self.last_action[ids] = 0.0
+        self.action_change[ids] = 0.0
+        self.clock[ids] = 0.0
+        self.exploded[ids] = False
+        self._read()
+
+    def _lookup(self, cells: Tensor, xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+        """Return the value of the cell that each point lies in; off the map, of the nearest."""
+        nx, ny = self.map_shape
+        i = ((xy[..., 0] - self.origin[0]) / self.resolution).long().clamp(0, nx - 1)
+        j = ((xy[..., 1] - self.origin[1]) / self.resolution).long().clamp(0, ny - 1)
+        return cells[i * ny + j]
+
+    # What the base class asks -----------------------------------------------------------------
+
+    def motion(self) -> tuple[Float[Tensor, "envs 4"], Float[Tensor, "envs 3"]]:
+        """Return the trunk's pose (x, y, z, yaw) and its velocity (vx, vy, wz) in the yaw frame."""
+        return self.pose, self.velocity
+
+    def proprioception(self) -> Float[Tensor, "envs 47"]:
+        """Return what `NOISE` lists, scaled; noisy if the settings say so."""
+        angle = 2 * math.pi * self.clock[:, None]
+        features = torch.cat(
+            (
+                self.body_velocity,
+                self.v[:, 3:6],
+                -self.up,
+                self.q[:, 7:] - self.stance,
+                self.v[:, 6:],
+                self.last_action,
+                torch.sin(angle),
+                torch.cos(angle),
+            ),
+            dim=-1,
+        )
+        if self.settings.noise:
+            features += self.noise * (2 * self._uniform(*features.shape) - 1)
+        # What is about to explode must not reach the learner either.
+        return (features * self.scale).clamp(-20.0, 20.0)
+
+    def truth(self, policy: Tensor) -> Float[Tensor, "envs 3"]:
+        """Return the trunk's velocity in its own frame, without noise, scaled as observed."""
+        return (self.body_velocity * self.scale[:3]).clamp(-20.0, 20.0)
+
+    def patches(self) -> Float[Tensor, "envs points"]:
+        """Return the patches that `sample_patches` would; the scan shares their points."""
+        points = self.pose[:, None, :2] + rotate(self.look_points, self.pose[:, 3])
+        look = sample_heights(self.heights, points, resolution=self.resolution, origin=self.origin)
+        self.look = look.reshape(-1, *LOOK_GRID.shape)
+        patch = self.look[:, : A1_GRID.shape[0]].flatten(1)
+        return patch - ground_height(patch, A1_GRID)
+
+    def scan(self, patch: Float[Tensor, "envs points"]) -> Float[Tensor, "envs 135"]:
+        """Return heights around the robot relative to its trunk, centred and scaled.
+
+        They come from where `patches` has just looked: unlike a patch, the policy sees its own
+        height above the ground.
+        """
+        rows, columns = SCAN_GRID.shape
+        side = (LOOK_GRID.shape[1] - columns) // 2
+        heights = self.look[:, -rows:, side : side + columns].flatten(1) - self.pose[:, 2:3]
+        if self.settings.noise:
+            heights += SCAN_NOISE * (2 * self._uniform(*heights.shape) - 1)
+        return SCAN_SCALE * (heights.clamp(-SCAN_LIMIT, SCAN_LIMIT) + STANCE_HEIGHT)
+
+    def fallen(self) -> Bool[Tensor, "envs"]:
+        """Tell which robots lie, touch the ground with the trunk, fell into a hole or exploded."""
+        touching = self.sensed[:, self.sensors["trunk_contact"]].any(dim=-1)
+        tipped = self.up[:, 2] < math.cos(MAX_TILT)
+        feet = self._feet("foot_position")
+        rim = self._lookup(self.rims, feet[..., :2])
+        dropped = (feet[..., 2] - FOOT_RADIUS < rim - DROP).any(dim=-1)
+        falling = self.v[:, 2] < -FREE_FALL
+        return touching | tipped | dropped | falling | self.exploded.to(self.device)
+
+    def drawing(self) -> Float[np.ndarray, "envs 19"]:
+        """Return qpos: trunk position (world), trunk quaternion (w, x, y, z) and joint angles."""
+        return self.physics.qpos.numpy().copy()
+
+    def reward(self, r_v: Tensor, failed: Bool[Tensor, "envs"]) -> Float[Tensor, "envs"]:
+        """Return the weighted sum of the terms, floored at zero: ending early never pays."""
+        total = sum(self.reward_terms().values(), torch.zeros(self.num_envs, device=self.device))
+        return self.control_dt * torch.where(failed, 0.0, total.clamp(min=0.0))
+
+    def reward_terms(self) -> dict[str, Float[Tensor, "envs"]]:
+        """Return each weighted term of the step just taken, per second."""
+        velocity = self.along_heading(self.pose, self.velocity)
+        wrong = (velocity - self.command[:, :2]).norm(dim=-1)
+        turn = self.velocity[:, 2] - self.command[:, 2]
+        # Felt by its nose: who is told to turn on the spot and does not has no other speed to miss.
+        nose = torch.hypot(wrong, NOSE * turn)
+        style = observation.moving(nose)
+        force = self._feet("foot_force").norm(dim=-1)
+        foot = self._feet("foot_position")
+        gait = observation.gait(
+            observation.stance_share(self.clock),
+            force,
+            self._feet("foot_velocity").norm(dim=-1),
+            foot[..., 2] - FOOT_RADIUS - self._lookup(self.edges, foot[..., :2]),
+            self.settings.swing_height,
+        )
+        terms = {
+            "tracking": observation.kernel(wrong, 0.1),
+            "approach": observation.kernel(nose, 0.25),
+            "turning": style * observation.kernel(turn, 0.25),
+            "gait": style * gait,
+            "posture": style * observation.posture(self.q[:, 7:] - self.stance),
+            "orientation": self.up[:, :2].square().sum(-1),
+            "bounce": self.v[:, 2].square(),
+            "wobble": self.v[:, 3:5].square().sum(-1),
+            "limits": observation.limits(self.q[:, 7:]),
+            "jerk": self.action_change.square().sum(-1),
+            "landing": observation.landing(force),
+        }
+        weights = self.settings.weights
+        return {f.name: getattr(weights, f.name) * terms[f.name] for f in fields(weights)}
+
+    def _feet(self, name: str) -> Float[Tensor, "envs 4 3"]:
+        """Return a group of sensors, one vector a foot."""
+        return self.sensed[:, self.sensors[name]].reshape(-1, 4, 3)
+
+
+def world_spec(world: World, model: A1Config) -> mujoco.MjSpec:
+    """Return the model of the world: boxes if its ground is made of blocks, else a height field."""
+    tiles = [tile for row in world.tiles for tile in row]
+    if all(tile.boxes or _blocky(tile.elevation) for tile in tiles):
+        return build_spec(world.boxes, config=model)
+    return build_spec(heightfield=world.elevation.filled(), config=model)
+
+
+def _blocky(elevation: ElevationMap) -> bool:
+    """Tell whether most neighbouring cells have equal heights, so that few boxes suffice."""
+    heights = np.asarray(elevation.filled().heights)
+    return all(float((np.diff(heights, axis=k) == 0).mean()) > 0.9 for k in (0, 1))
+
+
+def _edges(ground: Float[np.ndarray, "nx ny"]) -> Float[np.ndarray, "nx ny"]:
+    """Return the height of each cell or of an edge beside it; a steady slope has no edge.
+
+    The rise to a neighbour counts as far as it exceeds the rise up to here from the other side.
+    """
+    nx, ny = ground.shape
+    padded = np.pad(ground, 1, mode="edge")
+    edge = np.zeros_like(ground)
+    for i, j in itertools.product((-1, 0, 1), repeat=2):
+        ahead = padded[1 + i : 1 + i + nx, 1 + j : 1 + j + ny] - ground
+        behind = ground - padded[1 - i : 1 - i + nx, 1 - j : 1 - j + ny]
+        edge = np.maximum(edge, ahead - behind.clip(min=0.0))
+    return ground + edge
+
+
+def _quaternion(
+    roll: Float[Tensor, "n"], pitch: Float[Tensor, "n"], yaw: Float[Tensor, "n"]
+) -> Float[Tensor, "n 4"]:
+    """Return (w, x, y, z) of the rotation about x, then y, then z of the world (REP-103)."""
+    (cr, cp, cy), (sr, sp, sy) = (
+        [trig(a / 2) for a in (roll, pitch, yaw)] for trig in (torch.cos, torch.sin)
+    )
+    return torch.stack(
+        (
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ),
+        dim=-1,
+    )

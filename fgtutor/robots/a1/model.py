@@ -1,0 +1,409 @@
+"""The Unitree A1 as a MuJoCo model: its published constants, and how terrain enters the simulation.
+
+Reads the terrain as boxes or as an elevation map; gives an `MjSpec` for `physics.Physics`. The
+constants come from the maker's description, robots/a1_description/urdf/a1.urdf in
+unitreerobotics/unitree_ros on GitHub ("URDF" below), where no other source is named.
+"""
+
+# MuJoCo's compiled modules carry no type information that pyright could read.
+# pyright: reportAttributeAccessIssue=false
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated
+
+import mujoco
+import numpy as np
+from annotated_types import Interval
+from jaxtyping import Float
+
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError
+from fgtutor.io.validation import check_fields
+from fgtutor.world.terrain import Box
+
+Gain = Annotated[float, Interval(gt=0, le=1000)]
+"""A stiffness or a torque."""
+Damping = Annotated[float, Interval(ge=0, le=100)]
+"""A damping or an inertia."""
+
+LEGS = ("FR", "FL", "RR", "RL")
+"""Legs in the order of every array (F front, R rear; R right, L left), as in Unitree's SDK."""
+LINKS = ("hip", "thigh", "calf")
+"""Joints of a leg in order: abduction about x, then hip and knee flexion about y."""
+JOINTS = tuple(f"{leg}_{link}" for leg in LEGS for link in LINKS)
+"""The 12 joints and actuators in the order of qpos[7:], qvel[6:] and ctrl."""
+MIRROR = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)
+"""For each joint, the index of its mirror image in the plane y = 0."""
+MIRROR_SIGNS = (-1.0, 1.0, 1.0) * 4
+"""Factor that mirrors an angle: abduction changes sign, flexion does not."""
+
+LEG_X, LEG_Y = 0.1805, 0.047
+"""Hip joint from the trunk's centre, ahead and to the side, m (URDF)."""
+HIP_OFFSET = 0.0838
+"""Sideways distance from the abduction axis to the thigh, m (URDF)."""
+THIGH_LENGTH = CALF_LENGTH = 0.2
+"""Length of thigh and calf, m (URDF)."""
+FOOT_RADIUS = 0.02
+"""Radius of the foot, m (URDF)."""
+TRUNK_SIZE = (0.267, 0.194, 0.114)
+"""Length, width and height of the trunk's hull, m (URDF: a box between two cylinders)."""
+
+JOINT_RANGES = {
+    "hip": (-0.802851455917, 0.802851455917),
+    "thigh": (-1.0471975512, 4.18879020479),
+    "calf": (-2.69653369433, -0.916297857297),
+}
+"""Limits of each joint, rad (URDF)."""
+VELOCITY_LIMIT = 21.0
+"""Highest joint speed, rad/s (URDF). Not enforced by the model; rewards and checks may use it."""
+
+STANCE = (-0.1, 0.9, -1.7, 0.1, 0.9, -1.7, -0.1, 1.0, -1.7, 0.1, 1.0, -1.7)
+"""Joint angles the robot stands in and actions are relative to, rad (legs slightly apart)."""
+STANCE_HEIGHT = 0.29
+"""Height of the trunk's centre over flat ground in the stance, before the springs sag, m."""
+
+
+@dataclass(frozen=True)
+class Inertia:
+    """Mass properties of one link in its own frame."""
+
+    mass: float
+    """Mass, kg."""
+    centre: tuple[float, float, float]
+    """Centre of mass, m."""
+    moments: tuple[float, float, float, float, float, float]
+    """ixx, iyy, izz, ixy, ixz, iyz about the centre of mass, kg m^2."""
+
+
+# All from the URDF. Its trunk weighs 6.0 kg; mujoco_menagerie's A1, made from an older file, has
+# 4.713 kg and is otherwise the same. Leg links are given for the left front leg.
+TRUNK = Inertia(
+    6.0, (0.0, 0.0041, -0.0005), (0.0158533, 0.0377999, 0.0456542, -3.66e-05, -6.11e-05, -2.75e-05)
+)
+HIP = Inertia(
+    0.696,
+    (-0.003311, 0.000635, 3.1e-05),
+    (0.000469246, 0.00080749, 0.000552929, -9.409e-06, -3.42e-07, -4.66e-07),
+)
+THIGH = Inertia(
+    1.013,
+    (-0.003237, -0.022327, -0.027326),
+    (0.005529065, 0.005139339, 0.001367788, 4.825e-06, 0.000343869, 2.2448e-05),
+)
+CALF = Inertia(
+    0.166,
+    (0.006435, 0.0, -0.107388),
+    (0.002997972, 0.003014022, 3.2426e-05, 0.0, -0.000141163, 0.0),
+)
+FOOT = Inertia(0.06, (0.0, 0.0, -CALF_LENGTH), (9.6e-06, 9.6e-06, 9.6e-06, 0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class A1Config:
+    """What can be chosen about the A1 and its simulation; the rest is the robot itself."""
+
+    kp: Gain = 35.0
+    """Stiffness of the joint controllers, N m / rad (28 to 40 are usual in published A1 work)."""
+    kd: Damping = 0.5
+    """Damping of the joint controllers, N m s / rad."""
+    torque_limit: Gain = 33.5
+    """Highest joint torque, N m (URDF)."""
+    armature: Damping = 0.01
+    """Rotor inertia seen at abduction and hip joints, kg m^2 (mujoco_menagerie's A1)."""
+    knee_armature: Damping = 0.02
+    """Rotor inertia seen at the knee, behind its additional linkage, kg m^2."""
+    damping: Damping = 0.01
+    """Passive joint damping, N m s / rad (URDF). Its dry friction of 0.2 N m is left out: it would
+    add 12 rows to every contact problem for less than 1 % of the torque limit."""
+    friction: Annotated[float, Interval(gt=0, le=5)] = 0.8
+    """Sliding friction on any terrain (mujoco_menagerie's A1 foot). To randomise it, write
+    `physics.parameter("opt.o_friction")[:, :2]`."""
+    timestep: Annotated[float, Interval(ge=1e-4, le=0.05)] = 0.005
+    """One simulation step, s; four make one control step at 50 Hz."""
+    iterations: Annotated[int, Interval(ge=1, le=1000)] = 5
+    """Newton iterations at most; more change nothing visible, and a GPU back end needs few."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+SENSORS = {
+    "foot_force": (4, 3),
+    "foot_position": (4, 3),
+    "foot_velocity": (4, 3),
+    "leg_contact": (4, 2),
+    "trunk_contact": (1, 1),
+    "accelerometer": (1, 3),
+}
+"""Groups of sensors in the order of the sensor array: how many, and numbers each. Legs as in LEGS.
+
+foot_force: what the ground pushes the foot with, world frame, N; foot_position and foot_velocity:
+centre of the foot, world frame, m and m/s; leg_contact: number of contacts of knee and of shin;
+trunk_contact: number of contacts of the trunk; accelerometer: trunk frame, m/s^2, +g at rest."""
+
+
+def sensor_slices() -> dict[str, slice]:
+    """Return where each group of `SENSORS` lies in the sensor array."""
+    slices, start = {}, 0
+    for name, (count, width) in SENSORS.items():
+        slices[name] = slice(start, start + count * width)
+        start += count * width
+    return slices
+
+
+def combined(first: Inertia, second: Inertia) -> Inertia:
+    """Return the inertia of two links welded together (parallel-axis theorem)."""
+    mass = first.mass + second.mass
+    centre = (first.mass * np.array(first.centre) + second.mass * np.array(second.centre)) / mass
+    total = np.zeros((3, 3))
+    for link in (first, second):
+        offset = np.array(link.centre) - centre
+        total += _matrix(link.moments)
+        total += link.mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+    rows, columns = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
+    x, y, z = centre.tolist()
+    ixx, iyy, izz, ixy, ixz, iyz = total[rows, columns].tolist()
+    return Inertia(mass, (x, y, z), (ixx, iyy, izz, ixy, ixz, iyz))
+
+
+def mirrored(link: Inertia, x: int, y: int) -> Inertia:
+    """Return the inertia reflected to the leg on side (x, y), each +1 or -1 (+1: front, left)."""
+    cx, cy, cz = link.centre
+    ixx, iyy, izz, ixy, ixz, iyz = link.moments
+    return Inertia(link.mass, (x * cx, y * cy, cz), (ixx, iyy, izz, x * y * ixy, x * ixz, y * iyz))
+
+
+def _matrix(moments: tuple[float, ...]) -> Float[np.ndarray, "3 3"]:
+    ixx, iyy, izz, ixy, ixz, iyz = moments
+    return np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+
+
+def build_spec(
+    boxes: Iterable[Box] = (),
+    heightfield: ElevationMap | None = None,
+    *,
+    config: A1Config | None = None,
+    visuals: bool = False,
+) -> mujoco.MjSpec:
+    """Return the A1 on the given terrain; on an endless flat floor if none is given.
+
+    Boxes have exact edges and are faster; a height field takes any filled map. `visuals` adds a
+    light and shapes to look at, which physics neither needs nor feels: qpos means the same.
+    Raises `ConfigError` if the height field has unknown cells.
+    """
+    config = config or A1Config()
+    boxes = tuple(boxes)
+    spec = mujoco.MjSpec()
+    spec.modelname = "a1"
+    spec.compiler.degree = False
+    _set_options(spec, config)
+    if visuals:
+        sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        spec.worldbody.add_light(name="sun", type=sun, pos=(0.0, 0.0, 10.0), dir=(0.3, 0.2, -1.0))
+    _add_robot(spec, config, visuals)
+    for box in boxes:
+        add_box(spec, box)
+    if heightfield is not None:
+        add_heightfield(spec, heightfield)
+    elif not boxes:
+        _add_terrain_geom(spec, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0))
+    key = spec.add_key(name="stance")
+    key.qpos = (0.0, 0.0, STANCE_HEIGHT, 1.0, 0.0, 0.0, 0.0, *STANCE)
+    key.ctrl = STANCE
+    return spec
+
+
+def add_box(spec: mujoco.MjSpec, box: Box) -> None:
+    """Add one box of terrain; `box.size` holds full lengths, MuJoCo wants half."""
+    half = tuple(length / 2 for length in box.size)
+    _add_terrain_geom(
+        spec, type=mujoco.mjtGeom.mjGEOM_BOX, pos=box.centre, quat=box.quaternion, size=half
+    )
+
+
+def add_heightfield(spec: mujoco.MjSpec, elevation: ElevationMap, *, base: float = 0.1) -> None:
+    """Add an elevation map as a height field whose vertices are the centres of the cells.
+
+    It covers the map but for half a cell along the border; `base` is its thickness below the lowest
+    cell, m. Raises `ConfigError` if the map has unknown cells.
+    """
+    heights = np.asarray(elevation.heights, dtype=float)
+    if not np.isfinite(heights).all():
+        raise ConfigError("a height field needs every height; call elevation.filled() first")
+    low = float(heights.min())
+    # MuJoCo refuses a height field without relief, so a flat map gets a token one it never reaches.
+    relief = max(float(heights.max()) - low, 1e-6)
+    nx, ny = heights.shape
+    # Rows of a MuJoCo height field run along y and columns along x: [ix, iy] is transposed.
+    half = elevation.resolution / 2
+    spec.add_hfield(
+        name="terrain",
+        nrow=ny,
+        ncol=nx,
+        size=((nx - 1) * half, (ny - 1) * half, relief, base),
+        userdata=((heights - low) / relief).T.ravel(),
+    )
+    x, y = elevation.origin[0] + nx * half, elevation.origin[1] + ny * half
+    _add_terrain_geom(
+        spec, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="terrain", pos=(x, y, low)
+    )
+
+
+def _add_terrain_geom(spec: mujoco.MjSpec, **properties: object) -> None:
+    # Terrain only receives contacts and the robot only makes them, so neither meets itself.
+    spec.worldbody.add_geom(contype=0, conaffinity=1, rgba=(0.62, 0.6, 0.57, 1.0), **properties)
+
+
+def _set_options(spec: mujoco.MjSpec, config: A1Config) -> None:
+    option = spec.option
+    option.timestep = config.timestep
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations = config.iterations
+    # What sleeps is not computed, and terrain always does: 2,500 boxes then cost half a step less.
+    option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    # One friction for every contact, kept in the options: given per geom, randomising it would copy
+    # an array as long as the terrain into every simulation at every call.
+    option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_OVERRIDE)
+    option.o_friction = (config.friction, config.friction, 0.005, 0.0001, 0.0001)
+    # Bounding volumes only serve drawing, yet cost time in every step while they are on.
+    spec.visual.global_.bvactive = False
+
+
+def _add_robot(spec: mujoco.MjSpec, config: A1Config, visuals: bool) -> None:
+    trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, STANCE_HEIGHT))
+    trunk.add_freejoint(name="trunk")
+    trunk.sleep = mujoco.mjtSleepPolicy.mjSLEEP_NEVER
+    _set_inertia(trunk, TRUNK)
+    trunk.add_site(name="imu")
+    length, width, height = TRUNK_SIZE
+    radius = height / 2
+    for leg in LEGS:
+        # A sphere in each corner stands for the hull: a box on a height field is expensive.
+        x, y = _side(leg)
+        corner = (x * length / 2, y * (width / 2 - radius), 0.0)
+        _add_collider(trunk, f"{leg}_corner", corner, radius)
+    if visuals:
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        _add_shape(trunk, type=box, size=(length / 2, width / 2, height / 2))
+        _add_shape(trunk, type=box, pos=(LEG_X, 0.0, 0.0), size=(0.07, 0.05, 0.04))
+    for leg in LEGS:
+        _add_leg(spec, trunk, leg, config, visuals)
+    _add_sensors(spec)
+
+
+def _add_leg(
+    spec: mujoco.MjSpec, trunk: mujoco.MjsBody, leg: str, config: A1Config, visuals: bool
+) -> None:
+    x, y = _side(leg)
+    hip = trunk.add_body(name=f"{leg}_hip", pos=(x * LEG_X, y * LEG_Y, 0.0))
+    thigh = hip.add_body(name=f"{leg}_thigh", pos=(0.0, y * HIP_OFFSET, 0.0))
+    calf = thigh.add_body(name=f"{leg}_calf", pos=(0.0, 0.0, -THIGH_LENGTH))
+    # Only the abduction housing differs between front and rear; thigh and calf point the same way.
+    _set_inertia(hip, mirrored(HIP, x, y))
+    _set_inertia(thigh, mirrored(THIGH, 1, y))
+    _set_inertia(calf, mirrored(combined(CALF, FOOT), 1, y))
+
+    for link, body in zip(LINKS, (hip, thigh, calf), strict=True):
+        body.add_joint(
+            name=f"{leg}_{link}",
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=(1.0, 0.0, 0.0) if link == "hip" else (0.0, 1.0, 0.0),
+            range=JOINT_RANGES[link],
+            armature=config.knee_armature if link == "calf" else config.armature,
+            damping=(config.damping, 0.0, 0.0),
+        )
+        actuator = spec.add_actuator(
+            name=f"{leg}_{link}",
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            target=f"{leg}_{link}",
+            forcerange=(-config.torque_limit, config.torque_limit),
+            forcelimited=True,
+        )
+        actuator.set_to_position(kp=config.kp, kv=config.kd)
+
+    # The knee's housing is about as wide as the thigh, 0.0245 x 0.034 m (URDF); the shin 0.016 m.
+    _add_collider(thigh, f"{leg}_knee", (0.0, 0.0, -THIGH_LENGTH), 0.02)
+    _add_collider(calf, f"{leg}_shin", (0.0, 0.0, -CALF_LENGTH / 2), 0.015)
+    _add_collider(calf, f"{leg}_foot", (0.0, 0.0, -CALF_LENGTH), FOOT_RADIUS)
+    calf.add_site(name=f"{leg}_foot", pos=(0.0, 0.0, -CALF_LENGTH))
+    if visuals:
+        ends = ((0.0, y * HIP_OFFSET, 0.0), (0.0, 0.0, -THIGH_LENGTH), (0.0, 0.0, -CALF_LENGTH))
+        for body, end, radius in zip((hip, thigh, calf), ends, (0.04, 0.017, 0.01), strict=True):
+            capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
+            _add_shape(body, type=capsule, fromto=(0.0, 0.0, 0.0, *end), size=(radius, 0.0, 0.0))
+
+
+def _side(leg: str) -> tuple[int, int]:
+    return (1 if leg[0] == "F" else -1), (1 if leg[1] == "L" else -1)
+
+
+def _set_inertia(body: mujoco.MjsBody, link: Inertia) -> None:
+    body.mass = link.mass
+    body.ipos = link.centre
+    body.fullinertia = link.moments
+    body.explicitinertial = True
+
+
+def _add_collider(
+    body: mujoco.MjsBody, name: str, pos: tuple[float, float, float], radius: float
+) -> None:
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        pos=pos,
+        size=(radius, 0.0, 0.0),
+        contype=1,
+        conaffinity=0,
+        group=3,
+    )
+
+
+def _add_shape(body: mujoco.MjsBody, **properties: object) -> None:
+    body.add_geom(contype=0, conaffinity=0, group=2, rgba=(0.22, 0.23, 0.26, 1.0), **properties)
+
+
+def _add_sensors(spec: mujoco.MjSpec) -> None:
+    kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
+    for leg in LEGS:
+        _add_contact(spec, f"{leg}_foot_force", objects.mjOBJ_GEOM, f"{leg}_foot", force=True)
+    for kind, sensor in (
+        ("foot_position", kinds.mjSENS_FRAMEPOS),
+        ("foot_velocity", kinds.mjSENS_FRAMELINVEL),
+    ):
+        for leg in LEGS:
+            spec.add_sensor(
+                name=f"{leg}_{kind}",
+                type=sensor,
+                objtype=objects.mjOBJ_SITE,
+                objname=f"{leg}_foot",
+            )
+    for leg in LEGS:
+        for part in ("knee", "shin"):
+            _add_contact(spec, f"{leg}_{part}_contact", objects.mjOBJ_GEOM, f"{leg}_{part}")
+    _add_contact(spec, "trunk_contact", objects.mjOBJ_BODY, "trunk")
+    spec.add_sensor(
+        name="accelerometer",
+        type=kinds.mjSENS_ACCELEROMETER,
+        objtype=objects.mjOBJ_SITE,
+        objname="imu",
+    )
+
+
+def _add_contact(
+    spec: mujoco.MjSpec, name: str, kind: mujoco.mjtObj, target: str, *, force: bool = False
+) -> None:
+    field = (
+        mujoco.mjtConDataField.mjCONDATA_FORCE if force else mujoco.mjtConDataField.mjCONDATA_FOUND
+    )
+    spec.add_sensor(
+        name=name,
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        # The force acts on what stands here as the reference; as the object it would change sign.
+        reftype=kind,
+        refname=target,
+        # What to report (bits), how to reduce several contacts (3: net force, 0: none), how many.
+        intprm=(1 << int(field), 3 if force else 0, 1),
+    )

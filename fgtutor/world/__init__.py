@@ -1,0 +1,1 @@
+"""The ground: boxes, obstacles, terrains, and maps made from scans."""
