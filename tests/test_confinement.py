@@ -113,7 +113,7 @@ def test_our_package_is_closed_also_where_it_is_installed_among_others(tmp_path)
     (packages / "other").symlink_to(packages / "fgtutor")
     (packages / "~gtutor").symlink_to(packages / "numpy")
     code = (
-        "import os, sys\nfrom fgtutor.course import confinement as c\n"
+        "import os, sys\nfrom fgtutor.course.grading import confinement as c\n"
         f"root, packages = {str(tmp_path / 'lib')!r}, {str(packages)!r}\n"
         "sys.path.append(packages)\n"
         "folders, closed = c.readable()\n"

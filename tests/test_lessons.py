@@ -9,6 +9,7 @@ import torch
 from matplotlib.image import AxesImage
 
 from fgtutor.course import a1_lessons, lessons, notebooks
+from fgtutor.course.widgets.live_curve import LiveCurve
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.execution import FollowConfig, execute
@@ -174,9 +175,10 @@ def test_the_live_curve_draws_at_once_then_now_and_then(monkeypatch):
             shown.append(figure)
 
     monkeypatch.setattr(
-        "IPython.display.display", lambda figure, **_: shown.append(figure) or Handle()
+        "fgtutor.course.widgets.live_curve.display",
+        lambda figure, **_: shown.append(figure) or Handle(),
     )
-    live = charts.LiveCurve(seconds=1000)
+    live = LiveCurve(seconds=1000)
     for iteration in (1, 2, 3):
         live({"samples": iteration, "r_v": 0.5, "failed": 0.0, "row": 0.0})
     assert len(shown) == 1  # the first row at once, the next after 1000 s

@@ -5,7 +5,6 @@ Reads numbers by name; gives pictures. A policy has its own colour here as every
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, cast
 
@@ -19,7 +18,6 @@ from torch import Tensor
 from fgtutor.errors import ConfigError
 from fgtutor.feasibility import ood_weight
 from fgtutor.figures.canvas import POLICY_COLOURS, TITLE, Picture
-from fgtutor.figures.maps import training_curve
 from fgtutor.io.validation import Positive, check_arguments
 from fgtutor.statistics import wilson_interval
 from fgtutor.world.terrain import Terrain
@@ -57,32 +55,6 @@ def draw_curves(
         axes.legend(frameon=False, fontsize=9)
     axes.set_title(title, **TITLE, loc="left")
     return cast(Figure, axes.get_figure(root=True))
-
-
-class LiveCurve:
-    """A training curve that draws itself anew as rows come in: pass it as `on_iteration`."""
-
-    def __init__(self, seconds: float = 3.0) -> None:
-        """Show the picture here and now; it is drawn anew after that many seconds at the least."""
-        self.rows: list[dict[str, float]] = []
-        self.seconds, self.last, self.handle = seconds, -np.inf, None
-
-    def __call__(self, row: dict[str, float]) -> None:
-        """Take one iteration's numbers."""
-        self.rows.append(row)
-        if time.monotonic() - self.last >= self.seconds:
-            self.draw()
-
-    def draw(self, rows: Sequence[Mapping[str, float]] | None = None) -> None:
-        """Draw these rows, such as those of a run that was resumed; by default those so far."""
-        from IPython.display import display
-
-        picture = training_curve(self.rows if rows is None else rows)
-        if self.handle is None:
-            self.handle = display(picture, display_id=True)
-        else:
-            self.handle.update(picture)
-        self.last = time.monotonic()
 
 
 def draw_losses(

@@ -183,7 +183,7 @@ out = Path("runs") / f"02-gaps-{iterations}"
 
 # %%
 from fgtutor import train
-from fgtutor.figures.charts import LiveCurve
+from fgtutor.course.widgets.live_curve import LiveCurve
 from fgtutor.learning.training import TrainConfig
 
 live = LiveCurve()

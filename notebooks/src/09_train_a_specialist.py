@@ -140,7 +140,7 @@ import signal
 from dataclasses import replace
 
 from fgtutor import train
-from fgtutor.figures.charts import LiveCurve
+from fgtutor.course.widgets.live_curve import LiveCurve
 
 live = LiveCurve()
 
