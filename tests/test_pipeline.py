@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from fgtutor import patches
+from fgtutor import patches, pipeline
 from fgtutor.cli.plan import PlanConfig, choose, run
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import (

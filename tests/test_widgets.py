@@ -43,8 +43,9 @@ def widgets():
     """The module of the widgets, which needs the lab extra."""
     pytest.importorskip("ipywidgets", reason="the lab extra is not installed: make test does")
     pytest.importorskip("anywidget", reason="the lab extra is not installed: make test does")
+    from fgtutor.course.widgets import views
 
-    return widgets
+    return views
 
 
 def say(board, **content) -> None:
@@ -53,7 +54,7 @@ def say(board, **content) -> None:
 
 
 def test_a_drag_redraws_and_the_text_follows(widgets, grid, said):
-    board = views.TauExplorer(grid, said, START, GOAL)
+    board = widgets.TauExplorer(grid, said, START, GOAL)
     before = dict(board.view.pictures), board.view.frame
     board.taus.value = (0.2, 0.7)
     alone = Explorer(grid, said, START, GOAL, taus=(0.2, 0.7))
@@ -70,7 +71,7 @@ def test_a_drag_redraws_and_the_text_follows(widgets, grid, said):
 
 
 def test_clicks_arrows_and_hovering_reach_the_explorer(widgets, grid, said):
-    board = views.TauExplorer(grid, said, START, GOAL)
+    board = widgets.TauExplorer(grid, said, START, GOAL)
     say(board, kind="press", cells=[[2, 5]], shift=False)
     assert board.explorer.settings.goal == grid.centre_of(2, 5)
     say(board, kind="drag", cells=[[3, 5], [4, 6]], shift=False)
@@ -92,7 +93,7 @@ def test_clicks_arrows_and_hovering_reach_the_explorer(widgets, grid, said):
 
 
 def test_a_painter_paints_what_is_dragged_over(widgets, make_specialist):
-    board = views.TerrainPainter(ElevationMap(np.zeros((20, 16))), make_specialist())
+    board = widgets.TerrainPainter(ElevationMap(np.zeros((20, 16))), make_specialist())
     before = dict(board.view.pictures)
     board.height.value, board.radius.value = 0.3, 0.1
     say(board, kind="drag", cells=[[5, 5], [8, 5]], shift=False)
@@ -108,7 +109,7 @@ def test_a_painter_paints_what_is_dragged_over(widgets, make_specialist):
 
 
 def test_a_drive_plays_pauses_and_resets(widgets, make_rolling):
-    board = views.DriveA1(make_terrain("flat", robot="toy"), {"steps": make_rolling()})
+    board = widgets.DriveA1(make_terrain("flat", robot="toy"), {"steps": make_rolling()})
     first = board.image.value
     assert Image.open(io.BytesIO(first)).size == (720, 272)
     board.speed.value = 0.5
@@ -147,6 +148,6 @@ def test_without_anywidget_there_is_a_png(widgets):
 
 def test_the_front_end_is_shipped_and_asks_no_network(widgets):
     for name in ("panels.js", "panels.css"):
-        text = (views.STATIC / name).read_text(encoding="utf-8")
+        text = (widgets.STATIC / name).read_text(encoding="utf-8")
         assert "://" not in text and "import " not in text
-    assert "export default" in views.CanvasView._esm
+    assert "export default" in widgets.CanvasView._esm

@@ -26,7 +26,7 @@ from fgtutor.world.terrain import Terrain, make_terrain
 
 ROBOT = "a1"
 """The robot that the demo shows unless told otherwise."""
-MAP = Path(__file__).parent / "zoo" / "maps" / "toy_mixed.npz"
+MAP = Path(__file__).parents[1] / "zoo" / "maps" / "toy_mixed.npz"
 """The toy's: four ways round a ridge; benchmarks/make_demo_map.py composes it."""
 START, GOAL = (1.0, 4.0), (11.0, 4.0)
 """On either side of the ridge, m."""

@@ -70,7 +70,7 @@ _RENDER = (
 class DoctorConfig:
     """Check the installation; the exit code is 1 if something essential is broken."""
 
-    zoo: Path = Path(__file__).parent / "zoo"
+    zoo: Path = Path(__file__).parents[1] / "zoo"
     """Folder of the zoo: <robot>/<specialist>."""
     gl: bool = True
     """Whether to try drawing with MuJoCo, in a process of its own."""

@@ -21,6 +21,7 @@ from collections.abc import Collection, Iterator
 from contextlib import suppress
 from glob import escape, glob
 from importlib.abc import MetaPathFinder
+from pathlib import Path
 
 NO_NEW_PROCESS, FILES_UNREAD = "no new process", "other files unread"
 WALLS = frozenset({NO_NEW_PROCESS, FILES_UNREAD})
@@ -129,7 +130,7 @@ def readable() -> tuple[list[str], list[str]]:
     # pip leaves "~gtutor" behind when it is interrupted.
     inside = ("*gtutor*", "python*/*-packages/*gtutor*")
     copies = [os.path.join(escape(folder), name) for folder in found for name in inside]
-    package = os.path.dirname(os.path.dirname(real(__file__)))
+    package = str(Path(real(__file__)).parents[2])
     closed = {package, os.path.dirname(package), *(c for name in copies for c in glob(name))}
     return sorted(found), sorted(closed - found)
 

@@ -34,7 +34,7 @@ START = (
     "from fgtutor.course.grading.worker import main; main()"
 )
 """What the process runs: our package comes behind everything installed."""
-ROOT = str(Path(__file__).resolve().parents[2])
+ROOT = str(Path(__file__).resolve().parents[3])
 TRIES = 3
 """How often a process is started that ends before it has seen the submission."""
 LONGEST_WAIT = 600.0
