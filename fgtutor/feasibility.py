@@ -1,7 +1,8 @@
 """Feasibility-Net: how well a policy would track its command here, and whether it knows the place.
 
 Reads a patch H_xy (`patches.sample_patches`) and a velocity command; gives the feasibility f in
-[0, 1] and the reconstruction loss L_recon from which the weight w_ood follows.
+[0, 1] and the reconstruction loss L_recon from which the weight w_ood follows. The labels that f
+is trained on come from a rollout's velocities (`tracking_reward`, `feasibility_labels`).
 Source: paper, Sec. III-A (Eqs. 1-3) and Sec. III-B (Eq. 4).
 """
 
@@ -12,7 +13,7 @@ from typing import Annotated, overload
 import numpy as np
 import torch
 from annotated_types import Interval
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from fgtutor.errors import ThresholdError
@@ -22,6 +23,45 @@ HeightScale = Annotated[float, Interval(gt=0, le=1000)]
 """Units of height per metre."""
 TAU_LOW, TAU_HIGH = 0.1, 2.0
 """The paper's thresholds on L_recon, summed over the patch (Eq. 4)."""
+SIGMA = 0.25
+"""Scale of the tracking reward, m/s (Eq. 1)."""
+
+
+def tracking_reward(
+    velocity: Float[Tensor, "*batch 2"], command: Float[Tensor, "*batch 2"], sigma: float = SIGMA
+) -> Float[Tensor, "*batch"]:
+    """Return r_v = exp(-||v - v_cmd||_2 / sigma), in (0, 1] (Eq. 1: the norm, unsquared)."""
+    return torch.exp(-(velocity - command).norm(dim=-1) / sigma)
+
+
+def feasibility_labels(
+    tracking: Float[Tensor, "time envs 3"], window: int
+) -> tuple[Float[Tensor, "time envs"], Bool[Tensor, "time envs"]]:
+    """Return the mean r_v over the next `window` steps, and where that mean is trustworthy.
+
+    `tracking[t]` holds (r_v, failed, ended) of the step that led to time t. A failure makes
+    the rest of its window zero; a time-out cuts it short; no label reaches into the next episode.
+    A label counts if at least half of its window was seen. `window` 0 means 1, the paper's label.
+
+    `failed` between 0 and 1 is a failure that reaches back over that share of the window only;
+    labels from further back treat it as a time-out.
+    """
+    window = max(window, 1)
+    steps = tracking.shape[0]
+    total = torch.zeros_like(tracking[..., 0])
+    seen = torch.zeros_like(total)
+    running = torch.ones_like(total, dtype=torch.bool)
+    reach = torch.zeros_like(total)
+    for ahead in range(1, min(window, steps - 1) + 1):
+        r_v, failed, ended = tracking[ahead:].unbind(-1)
+        now = running[:-ahead]
+        total[:-ahead] += r_v * now
+        seen[:-ahead] += now
+        reach[:-ahead] += window * failed * now
+        running[:-ahead] = now & (ended == 0)
+        running[-ahead:] = False
+    # Steps of a failed episode that never happened still count, as zeros.
+    return total / seen.maximum(reach).clamp(min=1), (seen >= (window + 1) // 2) | (reach > 0)
 
 
 class FeasibilityNet(nn.Module):

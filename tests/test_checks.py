@@ -13,13 +13,12 @@ from fgtutor import patches
 from fgtutor.course.checks import ex08, find
 from fgtutor.directions import STEPS, YAWS
 from fgtutor.elevation import ElevationMap
-from fgtutor.feasibility import calibrated_taus, ood_weight
+from fgtutor.feasibility import calibrated_taus, feasibility_labels, ood_weight, tracking_reward
 from fgtutor.fusion import fuse
-from fgtutor.learning.ppo import feasibility_labels
 from fgtutor.planning import as_networkx, as_switching_networkx, plan
 from fgtutor.robots.a1 import model as a1_model
 from fgtutor.robots.a1.randomise import A1EnvConfig
-from fgtutor.robots.commands import tracking_reward, turn_rate
+from fgtutor.robots.commands import turn_rate
 from fgtutor.statistics import calibration, spl, wilson_interval
 from fgtutor.tensorization import assess
 

@@ -13,8 +13,8 @@ from fgtutor.course.widgets.live_curve import LiveCurve
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.execution import FollowConfig, execute
+from fgtutor.feasibility import feasibility_labels
 from fgtutor.figures import canvas, charts, maps, videos
-from fgtutor.learning.ppo import feasibility_labels
 from fgtutor.patches import PatchGrid
 from fgtutor.planning import as_networkx
 from fgtutor.robots.toy import ToyEnv

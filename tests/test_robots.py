@@ -7,10 +7,11 @@ import torch
 
 from fgtutor import patches
 from fgtutor.errors import ConfigError
+from fgtutor.feasibility import tracking_reward
 from fgtutor.patches import sample_patches
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.robots.base import UNTRIED
-from fgtutor.robots.commands import EnvConfig, slowdown, tracking_reward, turn_rate
+from fgtutor.robots.commands import EnvConfig, slowdown, turn_rate
 from fgtutor.world.terrain import World, make_terrain
 
 robots = pytest.mark.parametrize("robot", sorted(ROBOTS))

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from fgtutor.errors import CheckpointError, ConfigError, StorageError
-from fgtutor.learning.ppo import feasibility_labels
+from fgtutor.feasibility import feasibility_labels
 from fgtutor.learning.trainer import read_checkpoint, write_checkpoint
 from fgtutor.learning.training import (
     A1TrainConfig,

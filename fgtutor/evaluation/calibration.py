@@ -19,10 +19,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from fgtutor.errors import ConfigError
-from fgtutor.feasibility import ood_weight
+from fgtutor.feasibility import feasibility_labels, ood_weight
 from fgtutor.io.storage import check_writable, write_json
 from fgtutor.io.validation import NonNegative, Seed, check_fields
-from fgtutor.learning.ppo import feasibility_labels
 from fgtutor.robots import env_class
 from fgtutor.specialist import Specialist, load_zoo
 from fgtutor.statistics import calibration

@@ -1,54 +1,23 @@
 """PPO that fits the Feasibility-Net on the way: one rollout, two losses, no shared weight.
 
 Reads rsl_rl's rollout storage, whose `tracking` group tells what happened after every step; gives
-labels for each patch and an algorithm that trains policy and Feasibility-Net side by side, and the
-context encoder of a blind policy.
+an algorithm that trains policy and Feasibility-Net side by side, and the context encoder of a blind
+policy.
 Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
 """
 
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
 from rsl_rl.algorithms import PPO
 from rsl_rl.utils import reduce_gradients_in_buckets
 from torch import Tensor, nn
 
-from fgtutor.feasibility import FeasibilityNet
+from fgtutor.feasibility import FeasibilityNet, feasibility_labels
 from fgtutor.policies.dreamwaq import ContextNet, DreamWaQModel
 
 QUANTILES = (0.5, 0.9, 0.95, 0.99)
 """Quantiles of L_recon that a specialist stores, for calibrated taus."""
-
-
-def feasibility_labels(
-    tracking: Float[Tensor, "time envs 3"], window: int
-) -> tuple[Float[Tensor, "time envs"], Bool[Tensor, "time envs"]]:
-    """Return the mean r_v over the next `window` steps, and where that mean is trustworthy.
-
-    `tracking[t]` holds (r_v, failed, ended) of the step that led to time t. A failure makes
-    the rest of its window zero; a time-out cuts it short; no label reaches into the next episode.
-    A label counts if at least half of its window was seen. `window` 0 means 1, the paper's label.
-
-    `failed` between 0 and 1 is a failure that reaches back over that share of the window only: who
-    is further away from it does not know of it, as with a time-out.
-    """
-    window = max(window, 1)
-    steps = tracking.shape[0]
-    total = torch.zeros_like(tracking[..., 0])
-    seen = torch.zeros_like(total)
-    running = torch.ones_like(total, dtype=torch.bool)
-    reach = torch.zeros_like(total)
-    for ahead in range(1, min(window, steps - 1) + 1):
-        r_v, failed, ended = tracking[ahead:].unbind(-1)
-        now = running[:-ahead]
-        total[:-ahead] += r_v * now
-        seen[:-ahead] += now
-        reach[:-ahead] += window * failed * now
-        running[:-ahead] = now & (ended == 0)
-        running[-ahead:] = False
-    # Steps of a failed episode that never happened still count, as zeros.
-    return total / seen.maximum(reach).clamp(min=1), (seen >= (window + 1) // 2) | (reach > 0)
 
 
 class FeasibilityPPO(PPO):

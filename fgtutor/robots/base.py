@@ -20,6 +20,7 @@ from torch import Tensor
 
 from fgtutor import patches
 from fgtutor.errors import ConfigError
+from fgtutor.feasibility import tracking_reward
 from fgtutor.io.validation import Count, check_arguments
 from fgtutor.patches import PatchGrid, sample_patches
 from fgtutor.policies.dreamwaq import VELOCITY, History
@@ -30,7 +31,6 @@ from fgtutor.robots.commands import (
     bearing,
     off_by,
     slowdown,
-    tracking_reward,
     turn_rate,
 )
 from fgtutor.robots.lanes import Lanes

@@ -1,7 +1,7 @@
-"""What robots are told and how well they do it: episodes' settings, r_v, and turning to a heading.
+"""What robots are told: the settings of episodes, and how fast to turn to a heading.
 
-Reads velocities and headings; gives the tracking reward and turn rates. Shared by training, where
-episodes are drawn, and by execution, where a route is followed. Source: paper, Sec. III-A (Eq. 1).
+Reads headings; gives turn rates. Shared by training, where episodes are drawn, and by execution,
+where a route is followed.
 """
 
 import math
@@ -20,19 +20,8 @@ Speed = Annotated[float, Interval(ge=0, le=20)]
 """A speed, m/s."""
 Time = Annotated[float, Interval(gt=0, le=3600)]
 """A part of an episode, s."""
-SIGMA = 0.25
-"""Scale of the tracking reward, m/s (paper, Eq. 1)."""
-
-
 LOOKAHEAD = 0.45
 """Distance to the point on its line that a robot steers for, m, in training as on a route."""
-
-
-def tracking_reward(
-    velocity: Float[Tensor, "*batch 2"], command: Float[Tensor, "*batch 2"], sigma: float = SIGMA
-) -> Float[Tensor, "*batch"]:
-    """Return r_v = exp(-||v - v_cmd||_2 / sigma), in (0, 1] (paper, Eq. 1: the norm, unsquared)."""
-    return torch.exp(-(velocity - command).norm(dim=-1) / sigma)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -118,8 +118,8 @@ film_strip(flailing, terrain, route, count=6)
 # norm is not squared.
 
 # %%
+from fgtutor.feasibility import tracking_reward
 from fgtutor.figures.charts import draw_curves
-from fgtutor.robots.commands import tracking_reward
 
 v_hat = torch.tensor([0.85, 0.0])
 speeds = torch.linspace(-0.2, 1.8, 201)

@@ -61,7 +61,7 @@ rollout = collect(env, roll, seconds=12.0)
 # moment begins one row further on, and the 0.0 of the first row is in no label.
 
 # %%
-from fgtutor.learning.ppo import feasibility_labels
+from fgtutor.feasibility import feasibility_labels
 
 r_v, failed, ended = [0.0, 0.9, 0.6, 0.0, 0.8, 0.8], [0, 0, 0, 1, 0, 0], [0, 0, 0, 1, 0, 0]
 six_steps = torch.tensor([r_v, failed, ended]).T[:, None]  # [time, robots, 3]

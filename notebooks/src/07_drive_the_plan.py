@@ -76,7 +76,7 @@ film_strip(episode, terrain, planned.route, count=12)
 import numpy as np
 import torch
 
-from fgtutor.robots.commands import tracking_reward
+from fgtutor.feasibility import tracking_reward
 
 poses = episode.poses
 dt = episode.seconds / len(poses)
