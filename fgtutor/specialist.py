@@ -1,22 +1,20 @@
 """The specialist: one policy with its Feasibility-Net, and the folder that holds them on disk.
 
 Reads and gives folders of `policy.safetensors`, `feasibility.safetensors` and `specialist.json`;
-nothing is ever unpickled. Every later stage consumes specialists, and dropping a folder into the
-zoo adds one. Source: the pairs (pi_i, F_i) of the paper, Sec. III-C.
+nothing is ever unpickled, imported or called by a name from a file. Every later stage consumes
+specialists, and dropping a folder into the zoo adds one. Source: the pairs (pi_i, F_i) of the
+paper, Sec. III-C.
 """
 
 import hashlib
 import json
 import os
-import re
-import secrets
 import shutil
-import time
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import safetensors.torch
 import torch
@@ -27,39 +25,31 @@ from torch import Tensor, nn
 
 from fgtutor.errors import FgtutorError, SpecialistError
 from fgtutor.feasibility import FeasibilityNet
-from fgtutor.io.storage import atomic_write, storage_error
+from fgtutor.io.storage import beside, remove_leftovers, storage_error
+from fgtutor.io.tensors import CURE, Digest, check_tensors, digest, read_bytes, read_tensors
 from fgtutor.io.validation import (
+    LARGEST_RECORD,
     NAME,
     Name,
+    arguments,
     check_fields,
     parse_record,
 )
 from fgtutor.patches import PatchGrid
 from fgtutor.policies.description import PolicyConfig
 from fgtutor.policies.symmetry import SymmetricMLP
-from fgtutor.specialist_folder import (
-    CURE,
-    DESCRIPTION,
-    SCHEMA,
-    TENSORS,
-    Description,
-    Known,
-    Speed,
-    build_networks,
-    check_quantiles,
-    compare,
-    read_description,
-    read_tensors,
-    sizes_of,
-)
-from fgtutor.specialist_folder import checksum as _checksum
 
 ZOO = Path(__file__).parent / "zoo"
 """The shipped specialists: one folder <robot>/<name> each."""
 GENERAL = "general"
 """Name of the baseline trained on every terrain; it lies in the zoo but is no specialist."""
-STALE_SECONDS = 3600
-"""Age from which a hidden folder is known to be what a killed save left, s."""
+SCHEMA = 1
+"""Version of `specialist.json`; a reader refuses any other."""
+DESCRIPTION = "specialist.json"
+"""The file that describes the other two and holds their checksums."""
+TENSORS = ("policy.safetensors", "feasibility.safetensors")
+"""The weights of a specialist's two networks."""
+Speed = Annotated[float, Interval(ge=-100, le=100)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,9 +95,9 @@ class Specialist:
             )
         if self.command[0] <= 0:
             raise SpecialistError(f"command: 0: should go ahead, got {self.command}")
-        check_quantiles(self.quantiles)
-        known = {k: v for k, v in self.provenance.items() if k in Known.__annotations__}
-        parse_record(Known, known, SpecialistError, "provenance")
+        _check_quantiles(self.quantiles)
+        known = {k: v for k, v in self.provenance.items() if k in _Known.__annotations__}
+        parse_record(_Known, known, SpecialistError, "provenance")
 
     def __repr__(self) -> str:
         """Say in one line what a person wants to know about it."""
@@ -143,7 +133,8 @@ def save_specialist(specialist: Specialist, folder: str | Path) -> Path:
     """Write the specialist's folder, whole or not at all, and return its path.
 
     The files are written into a hidden sibling which then takes the folder's place. If the process
-    is killed between the two renames, the earlier folder is still whole under its hidden name.
+    is killed between the two renames, the earlier folder is still whole under its hidden name; the
+    next save removes it.
 
     Raises:
         SpecialistError: A weight is not finite, or the provenance cannot be written as JSON.
@@ -156,25 +147,26 @@ def save_specialist(specialist: Specialist, folder: str | Path) -> Path:
         raise SpecialistError(f"{folder} holds something else: choose another folder")
     where = specialist.name
     # Compared with what a reader will build: a folder that cannot be loaded is never written.
-    config, sizes = PolicyConfig.of(specialist.policy), sizes_of(specialist.feasibility)
-    twins = build_networks(config, sizes, "meta", where)
+    config, sizes = PolicyConfig.of(specialist.policy), _sizes_of(specialist.feasibility)
     payloads = {}
-    for file, module, twin in zip(TENSORS, _modules(specialist), twins, strict=True):
+    for file, module, twin in zip(
+        TENSORS, _networks(specialist), _build(config, sizes, "meta", where), strict=True
+    ):
         state = {k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}
-        compare(twin, state, f"{where} {file}")
+        check_tensors(twin, state, f"{where} {file}")
         payloads[file] = safetensors.torch.save(state)
-    payloads[DESCRIPTION] = _describe(specialist, payloads)
-    parse_record(Description, payloads[DESCRIPTION], SpecialistError, f"{where} {DESCRIPTION}")
+    payloads[DESCRIPTION] = _describe(specialist, config, sizes, payloads)
+    parse_record(_Description, payloads[DESCRIPTION], SpecialistError, f"{where} {DESCRIPTION}")
 
-    stamp = secrets.token_hex(4)
-    fresh = folder.with_name(f".{folder.name}.{stamp}.new")
-    previous = folder.with_name(f".{folder.name}.{stamp}.old")
+    fresh, previous = beside(folder, ".new"), beside(folder, ".old")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         fresh.mkdir()
         for file, payload in payloads.items():
-            with atomic_write(fresh / file) as path:
-                path.write_bytes(payload)
+            with (fresh / file).open("wb") as out:
+                out.write(payload)
+                out.flush()
+                os.fsync(out.fileno())  # data before names, or a power cut leaves empty files
         if folder.is_dir():
             os.replace(folder, previous)
         os.replace(fresh, folder)
@@ -185,7 +177,8 @@ def save_specialist(specialist: Specialist, folder: str | Path) -> Path:
         if isinstance(error, OSError):
             raise storage_error(folder, error) from error
         raise
-    _remove_leftovers(folder)
+    shutil.rmtree(previous, ignore_errors=True)
+    remove_leftovers(folder)  # only now: one of them may be the only whole copy
     return folder
 
 
@@ -202,26 +195,22 @@ def load_specialist(folder: str | Path) -> Specialist:
             f"no specialist folder {folder}: check the path, or train one with `fgtutor train`"
         )
     path = folder / DESCRIPTION
-    told = read_description(path)
+    told = _read_description(path)
     # Built without memory first: what the description claims may be larger than any machine.
-    twins = build_networks(told.policy, told.feasibility, "meta", str(path))
     tensors = [
-        read_tensors(folder / file, told, twin) for file, twin in zip(TENSORS, twins, strict=True)
+        read_tensors(folder / file, told.files[file], twin)
+        for file, twin in zip(
+            TENSORS, _build(told.policy, told.feasibility, "meta", str(path)), strict=True
+        )
     ]
-    policy, feasibility = build_networks(told.policy, told.feasibility, "cpu", str(path))
+    policy, feasibility = _build(told.policy, told.feasibility, "cpu", str(path))
     try:
         specialist = Specialist(
-            name=told.name,
-            robot=told.robot,
             policy=policy,
             feasibility=feasibility,
-            grid=told.grid,
-            command=told.command,
-            label_seconds=told.label_seconds,
-            quantiles=told.quantiles,
-            provenance=told.provenance,
+            **{name: getattr(told, name) for name in _PLAIN},
         )
-        for module, state in zip(_modules(specialist), tensors, strict=True):
+        for module, state in zip(_networks(specialist), tensors, strict=True):
             module.load_state_dict(state)
             module.eval().requires_grad_(False)
             for part in module.modules():
@@ -276,30 +265,51 @@ def load_zoo(
     return zoo
 
 
-def _modules(specialist: Specialist) -> tuple[nn.Module, nn.Module]:
-    """Return both networks, in the order of `TENSORS`."""
-    return specialist.policy, specialist.feasibility
+@dataclass(frozen=True, kw_only=True)
+class _Known:
+    """What is read of a provenance, which otherwise holds what its writer liked."""
+
+    terrain: Name = ""
+    samples: Annotated[int, Interval(ge=0, le=10**15)] = 0
 
 
-def _describe(specialist: Specialist, payloads: Mapping[str, bytes]) -> bytes:
+@dataclass(frozen=True, kw_only=True)
+class _Description:
+    """What `specialist.json` holds."""
+
+    schema: Literal[1]
+    name: Name
+    robot: Name
+    policy: PolicyConfig
+    feasibility: dict[str, Any]
+    grid: PatchGrid
+    command: tuple[Speed, Speed, Speed]
+    label_seconds: float
+    quantiles: dict[str, float]
+    provenance: dict[str, Any]
+    files: dict[str, Digest]
+    checksum: str
+
+
+_PLAIN = ("name", "robot", "grid", "command", "label_seconds", "quantiles", "provenance")
+"""What a description holds as a specialist does."""
+
+
+def _describe(
+    specialist: Specialist, config: PolicyConfig, sizes: dict[str, Any], payloads: dict[str, bytes]
+) -> bytes:
     """Return the bytes of `specialist.json`."""
-    description = {
-        "schema": SCHEMA,
-        "name": specialist.name,
-        "robot": specialist.robot,
-        "policy": asdict(PolicyConfig.of(specialist.policy)),
-        "feasibility": sizes_of(specialist.feasibility),
-        "grid": asdict(specialist.grid),
-        "command": specialist.command,
-        "label_seconds": specialist.label_seconds,
-        "quantiles": dict(specialist.quantiles),
-        "provenance": dict(specialist.provenance),
-        "files": {
-            file: {"bytes": len(payload), "sha256": hashlib.sha256(payload).hexdigest()}
-            for file, payload in payloads.items()
-        },
-    }
     try:
+        description = asdict(
+            _Description(
+                schema=SCHEMA,
+                policy=config,
+                feasibility=sizes,
+                files={file: digest(payload) for file, payload in payloads.items()},
+                checksum="",
+                **{name: getattr(specialist, name) for name in _PLAIN},
+            )
+        )
         description["checksum"] = _checksum(description)
         return (json.dumps(description, indent=2, allow_nan=False) + "\n").encode()
     except (TypeError, ValueError) as error:
@@ -309,12 +319,71 @@ def _describe(specialist: Specialist, payloads: Mapping[str, bytes]) -> bytes:
         ) from error
 
 
-def _remove_leftovers(folder: Path) -> None:
-    """Remove the folder's earlier version, and what killed saves have left beside it."""
-    hidden = re.compile(re.escape(f".{folder.name}.") + r"[0-9a-f]{8}\.(new|old)")
-    with suppress(OSError):
-        for path in folder.parent.iterdir():
-            found = hidden.fullmatch(path.name)
-            # Another process may just be writing a fresh one.
-            if found and (found[1] == "old" or time.time() - path.stat().st_mtime > STALE_SECONDS):
-                shutil.rmtree(path, ignore_errors=True)
+def _checksum(description: Mapping[str, Any]) -> str:
+    """Return the sha256 of a description without its own checksum, independent of its layout."""
+    content = {key: value for key, value in description.items() if key != "checksum"}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _read_description(path: Path) -> _Description:
+    """Read `specialist.json`, verifying its schema version, its own checksum and every value."""
+    payload = read_bytes(path, LARGEST_RECORD)
+    try:
+        description = json.loads(payload)
+        if not isinstance(description, dict):
+            raise TypeError(f"expected an object, got a {type(description).__name__}")
+        schema, stored = description.get("schema"), description.get("checksum")
+        computed = _checksum(description)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise SpecialistError(f"cannot read {path} ({error}): {CURE}") from error
+    if schema != SCHEMA:
+        raise SpecialistError(
+            f"{path} has schema {schema!r:.60}, this fgtutor reads {SCHEMA}: install the fgtutor "
+            "that wrote it, or train the specialist again"
+        )
+    if stored != computed:
+        raise SpecialistError(f"{path} was altered, its checksum does not match: {CURE}")
+    told = parse_record(_Description, payload, SpecialistError, str(path))
+    if set(told.files) != set(TENSORS):
+        raise SpecialistError(f"{path} lists {str([*told.files])!r:.100}, not {TENSORS}: {CURE}")
+    return told
+
+
+def _networks(specialist: Specialist) -> tuple[nn.Module, nn.Module]:
+    """Return both networks, in the order of `TENSORS`."""
+    return specialist.policy, specialist.feasibility
+
+
+def _sizes_of(net: FeasibilityNet) -> dict[str, Any]:
+    """Return the arguments that build a Feasibility-Net of this size."""
+    return {name: getattr(net, name) for name in arguments(FeasibilityNet).__annotations__}
+
+
+def _build(
+    config: PolicyConfig, sizes: Mapping[str, Any], device: str, where: str
+) -> tuple[MLPModel, FeasibilityNet]:
+    """Build both networks; torch's random state stays, so that a save changes no training."""
+    numbers = parse_record(
+        arguments(FeasibilityNet), sizes, SpecialistError, f"{where}: feasibility"
+    )
+    try:
+        with torch.random.fork_rng(devices=[]), torch.device(device):
+            return config.build(), FeasibilityNet(**vars(numbers))
+    except Exception as error:  # the class of a policy may be anybody's
+        raise SpecialistError(
+            f"{where}: no policy can be built of this description ({str(error)!r:.300}): {CURE}"
+        ) from error
+
+
+def _check_quantiles(quantiles: Mapping[str, float]) -> None:
+    """Raise `SpecialistError` unless they are quantiles: by probability, and growing with it."""
+    read = parse_record(dict[str, float], dict(quantiles), SpecialistError, "quantiles")
+    try:
+        pairs = [(0.0, 0.0), *sorted((float(share), value) for share, value in read.items())]
+    except ValueError as error:
+        raise SpecialistError(f"quantiles: need probabilities, {error}") from error
+    if not all(a < b < 1 and low <= high for (a, low), (b, high) in pairwise(pairs)):
+        raise SpecialistError(
+            f"quantiles: need numbers from 0 that grow with a probability below 1, got {read}"
+        )

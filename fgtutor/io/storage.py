@@ -66,7 +66,7 @@ def atomic_write_all(*paths: str | Path) -> Iterator[list[Path]]:
     try:
         try:
             targets = [_target(Path(path)) for path in paths]
-            temporaries = [_beside(target, target.suffix) for target in targets]
+            temporaries = [beside(target, target.suffix) for target in targets]
             yield temporaries
             for temporary in temporaries:
                 # Data must reach the disk before the name, or a power cut leaves an empty file.
@@ -96,17 +96,22 @@ def _target(path: Path) -> Path:
         raise storage_error(path, OSError(errno.EISDIR, os.strerror(errno.EISDIR)))
     if target.exists() and not target.is_file():
         raise storage_error(path, OSError(errno.EINVAL, "it is a device or a pipe"))
-    start = f".fgtutor-{_key(target)}-"
-    for file in target.parent.glob(f"{start}*"):
-        writer = file.name.removeprefix(start).split("-")[0]
-        if writer.isdecimal() and not _is_running(int(writer)):
-            with suppress(OSError):
-                file.unlink()
+    remove_leftovers(target)
     return target
 
 
-def _beside(path: Path, suffix: str = "") -> Path:
-    """Return a hidden, short name in the path's folder, which tells who writes which file."""
+def remove_leftovers(target: Path) -> None:
+    """Remove the files and folders that killed processes have left beside `target` (`beside`)."""
+    start = f".fgtutor-{_key(target)}-"
+    for path in target.parent.glob(f"{start}*"):
+        writer = path.name.removeprefix(start).split("-")[0]
+        if writer.isdecimal() and not _is_running(int(writer)):
+            with suppress(OSError):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def beside(path: Path, suffix: str = "") -> Path:
+    """Return a hidden, short name in the path's folder: of this process, and of this file."""
     suffix = suffix if len(os.fsencode(suffix)) <= 20 else ""
     return path.with_name(f".fgtutor-{_key(path)}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
 
@@ -132,7 +137,7 @@ def _copy(path: Path) -> Path | None:
     """Return a second name for a file, or a copy where the file system gives it none."""
     if not path.exists():
         return None
-    copy = _beside(path)
+    copy = beside(path)
     try:
         os.link(path, copy)
     except OSError:
@@ -149,7 +154,7 @@ def write_json(path: str | Path, data: Any) -> None:
 def check_writable(path: str | Path) -> None:
     """Raise `StorageError` now if `path` could not be written later, when the work is done."""
     try:
-        probe = _beside(_target(Path(path)))
+        probe = beside(_target(Path(path)))
         probe.touch()
         probe.unlink()
     except OSError as error:
