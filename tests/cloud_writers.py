@@ -10,8 +10,6 @@ import lzf
 import numpy as np
 from laspy.vlrs.vlr import VLR
 
-from fgtutor.io.clouds import save_points
-
 Writer = Callable[[Path, np.ndarray], object]
 
 
@@ -134,7 +132,7 @@ FORMATS: dict[str, tuple[str, Writer]] = {
     "xyz": ("cloud.xyz", xyz("", " ")),
     "xyz with names": ("cloud.xyz", xyz("# by hand\n\nX;Y;Z;I\n", ";")),
     "xyz with commas": ("cloud.xyz", xyz("//X,Y,Z,I\n", ", ")),
-    "npz": ("cloud.npz", lambda path, points: save_points(points, path)),
+    "npz": ("cloud.npz", lambda path, points: np.savez_compressed(path, points=points)),
 }
 
 

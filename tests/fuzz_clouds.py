@@ -14,11 +14,11 @@ POINTS = np.random.default_rng(0).random((40, 3)) * (2.0, 1.5, 0.3)
 
 
 def use_cloud(folder: Path) -> None:
-    from fgtutor.io.clouds import read_points
+    from fgtutor.io.clouds import read_cloud
     from fgtutor.world.scanning import map_points
 
     (path,) = list(folder.glob("*")) or [folder / "cloud.ply"]
-    points = read_points(path)
+    points = read_cloud(path).points
     assert points.dtype == np.float64 and points.ndim == 2 and points.shape[1] == 3 and len(points)
     assert np.isfinite(points).all()
     assert map_points(points).count.sum() <= len(points)

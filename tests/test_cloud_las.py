@@ -10,7 +10,7 @@ from cloud_writers import cloud, geokeys, las
 from rasterio.crs import CRS
 
 from fgtutor.errors import CloudError
-from fgtutor.io.clouds import read_cloud, read_points
+from fgtutor.io.clouds import read_cloud
 from fgtutor.world.scanning import ScanConfig, map_points
 
 FOOT, US_FOOT = 0.3048, 1200 / 3937
@@ -35,7 +35,7 @@ def test_every_point_format_gives_what_laspy_gives(tmp_path: Path, suffix: str, 
     if form in (4, 5, 9, 10) and suffix == ".laz":
         form = 3  # lazrs writes no waveforms
     las(path, cloud(), form=form, scale=0.0007)
-    np.testing.assert_array_equal(read_points(path), laspy.read(path).xyz)
+    np.testing.assert_array_equal(read_cloud(path).points, laspy.read(path).xyz)
 
 
 @pytest.mark.parametrize("version", ["1.2", "1.3", "1.4"])
@@ -127,7 +127,7 @@ def test_what_is_no_length_on_a_plane_is_refused(
 ) -> None:
     las(tmp_path / "cloud.las", cloud(), records=(record,), wkt=True)
     with pytest.raises(CloudError, match=message):
-        read_points(tmp_path / "cloud.las")
+        read_cloud(tmp_path / "cloud.las")
     assert capfd.readouterr() == ("", "")  # GDAL likes to print
 
 
@@ -182,15 +182,15 @@ def test_ground_seen_twice_and_points_of_models_are_kept(tmp_path: Path, form: i
     flags = ("synthetic", "key_point", *(("overlap",) if form == 6 else ()))
     marks |= dict.fromkeys(flags, np.ones(200, np.uint8))
     las(tmp_path / "cloud.las", cloud(), form=form, **marks)
-    assert len(read_points(tmp_path / "cloud.las")) == 200
+    assert len(read_cloud(tmp_path / "cloud.las").points) == 200
     las(tmp_path / "cloud.las", cloud(), form=form, classification=np.full(200, 12))
-    assert len(read_points(tmp_path / "cloud.las")) == 200
+    assert len(read_cloud(tmp_path / "cloud.las").points) == 200
 
 
 def test_a_cloud_of_noise_is_none(tmp_path: Path) -> None:
     las(tmp_path / "cloud.las", cloud(), classification=np.full(200, 7))
     with pytest.raises(CloudError, match="no point is left: 200 points of the noise classes"):
-        read_points(tmp_path / "cloud.las")
+        read_cloud(tmp_path / "cloud.las")
 
 
 def test_decimal_scales_finer_than_the_cell_serve_and_coarser_ones_do_not(tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_absurd_headers_are_refused(
     struct.pack_into(f"<{layout}", raw, at, *(value if isinstance(value, tuple) else (value,)))
     path.write_bytes(raw)
     with pytest.raises(CloudError, match=message):
-        read_points(path)
+        read_cloud(path)
 
 
 def test_a_laz_file_that_would_take_the_reader_down_is_refused(tmp_path: Path) -> None:
@@ -249,8 +249,8 @@ def test_a_laz_file_that_would_take_the_reader_down_is_refused(tmp_path: Path) -
     assert raw[chunks : chunks + 4] == (1).to_bytes(4, "little")  # 200 points are one chunk
     path.write_bytes(raw[:chunks] + b"\xff" * 4 + raw[chunks + 4 :])  # 64 GiB: lazrs aborts
     with pytest.raises(CloudError, match=r"lazrs could not decompress it .*export it again"):
-        read_points(path)
+        read_cloud(path)
     record = raw.index(b"laszip encoded") - 2 + 54
     path.write_bytes(raw[: record + 36] + b"\xff\xff" + raw[record + 38 :])
     with pytest.raises(CloudError, match="does not describe the points"):
-        read_points(path)
+        read_cloud(path)

@@ -8,7 +8,7 @@ import pytest
 from cloud_writers import DOUBLES, SPARE, cloud, pcd, ply
 
 from fgtutor.errors import CloudError
-from fgtutor.io.clouds import read_cloud, read_points
+from fgtutor.io.clouds import read_cloud
 from fgtutor.world.scanning import ScanConfig, map_points
 
 POINTS = cloud(4)
@@ -25,7 +25,7 @@ def faces(form: str) -> bytes:
 
 def read(path: Path, data: bytes) -> np.ndarray:
     path.write_bytes(data)
-    return read_points(path)
+    return read_cloud(path).points
 
 
 @pytest.fixture

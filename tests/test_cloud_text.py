@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgtutor.errors import CloudError
-from fgtutor.io.clouds import read_cloud, read_points
+from fgtutor.io.clouds import read_cloud
 
 EAST, NORTH, UP = 500000.5, 4649776.25, 100.125
 ONE = [[EAST, NORTH, UP]]
@@ -19,7 +19,7 @@ def file(tmp_path: Path) -> Path:
 
 def read(file: Path, text: str | bytes) -> list:
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return read_points(file).tolist()
+    return read_cloud(file).points.tolist()
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_what_cannot_be_told_is_refused_with_its_line(file: Path, text: str, mes
 def test_lines_are_counted_over_many_blocks(file: Path) -> None:
     rows = [f"{n} {n / 2} 1" for n in range(250_000)]
     file.write_text("\n".join(rows))
-    assert len(read_points(file)) == 250_000
+    assert len(read_cloud(file).points) == 250_000
     rows[230_000] = "nan 1 2"
     file.write_text("\n".join(rows))
     read = read_cloud(file)
@@ -126,4 +126,4 @@ def test_lines_are_counted_over_many_blocks(file: Path) -> None:
     rows[240_000] = "1 2"
     file.write_text("\n".join(rows))
     with pytest.raises(CloudError, match="line 240001 has 2 columns"):
-        read_points(file)
+        read_cloud(file)

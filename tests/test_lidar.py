@@ -9,7 +9,6 @@ from scipy import ndimage
 from fgtutor.cli import map
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import CloudError, ConfigError
-from fgtutor.io.clouds import save_points
 from fgtutor.robots.a1.model import STANCE_HEIGHT, TRUNK_SIZE
 from fgtutor.robots.lidar import LidarConfig, carried, pattern, scan_terrain, survey
 from fgtutor.world.scanning import ScanConfig, map_points
@@ -247,7 +246,7 @@ def test_what_lies_in_the_shadow_of_a_wall_stays_unknown() -> None:
 
 def test_a_cloud_goes_through_the_map_command(tmp_path: Path) -> None:
     terrain = make_terrain("steps", robot="toy", seed=1)
-    save_points(scan_terrain(terrain, config=quick()), tmp_path / "cloud.npz")
+    np.savez_compressed(tmp_path / "cloud.npz", points=scan_terrain(terrain, config=quick()))
     out = tmp_path / "map.npz"
     config = map.MapConfig(
         cloud=tmp_path / "cloud.npz", out=out, resolution=0.1, area=terrain.elevation.extent

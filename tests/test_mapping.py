@@ -9,7 +9,6 @@ from cloud_writers import geokeys, las, sheet
 from fgtutor.cli import map
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import CloudError, ConfigError, MapError, StorageError
-from fgtutor.io.clouds import save_points
 from fgtutor.io.validation import parse_options
 
 
@@ -48,7 +47,7 @@ def test_map_command_refuses_early_and_keeps_the_old_map(tmp_path: Path) -> None
     # Before it reads the cloud, which is not there either.
     with pytest.raises(StorageError, match="create the folder"):
         map.run(command(tmp_path / "none.las", "--out", tmp_path / "no" / "map.npz"))
-    save_points(sheet(), tmp_path / "cloud.npz")
+    np.savez_compressed(tmp_path / "cloud.npz", points=sheet())
     with pytest.raises(MapError, match=r"\.bmp"):
         map.run(command(tmp_path / "cloud.npz", "--out", tmp_path / "map.bmp"))
     assert out.read_text() == "old"
@@ -91,7 +90,7 @@ def test_the_last_line_says_what_was_left_out_and_why(
     ],
 )
 def test_areas_that_cannot_be_are_refused(tmp_path: Path, area: tuple, message: str) -> None:
-    save_points(sheet(), tmp_path / "cloud.npz")
+    np.savez_compressed(tmp_path / "cloud.npz", points=sheet())
     out = tmp_path / "map.npz"
     with pytest.raises((CloudError, ConfigError), match=message):
         map.run(command(tmp_path / "cloud.npz", "--out", out, "--area", *area))

@@ -20,7 +20,7 @@ import numpy as np
 
 from fgtutor.errors import MapError
 from fgtutor.grid import check_cells
-from fgtutor.io.rasters import decoding, heights_of, rows_of
+from fgtutor.io.rasters import heights_of, rows_of
 from fgtutor.io.storage import atomic_write
 from fgtutor.io.units import units_of_crs
 
@@ -71,7 +71,6 @@ def save_geotiff(elevation: "ElevationMap", path: Path) -> None:
             temporary.write_bytes(memory.getbuffer())
 
 
-@decoding
 def load_geotiff(path: Path) -> dict[str, Any]:
     """Return the arguments of the `ElevationMap` that a GeoTIFF holds.
 

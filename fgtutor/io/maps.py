@@ -6,13 +6,10 @@ about its numbers is obeyed, or the file is refused; so it is if it says what is
 
 import hashlib
 import mmap
-import stat
 import struct
-import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
@@ -21,7 +18,8 @@ from PIL import Image
 from fgtutor.errors import MapError
 from fgtutor.grid import check_cells
 from fgtutor.io.geotiff import load_geotiff, save_geotiff
-from fgtutor.io.rasters import decoding, heights_of, rows_of
+from fgtutor.io.rasters import heights_of, rows_of
+from fgtutor.io.reading import by_suffix, read_file, read_npz
 from fgtutor.io.storage import atomic_write, atomic_write_all
 from fgtutor.io.validation import parse_record
 
@@ -33,6 +31,8 @@ _LARGEST_SIDECAR = 4_000
 _UNKNOWN = 65535
 """The PNG value of an unknown cell; heights use 0..65534."""
 _PARTS = ("heights", "known", "resolution", "origin")
+_CURE = "write it again with ElevationMap.save"
+_COLOURS = {0: "grey", 2: "colours", 3: "a palette", 4: "grey and alpha", 6: "colours and alpha"}
 
 
 def write(elevation: "ElevationMap", path: Path) -> None:
@@ -42,7 +42,7 @@ def write(elevation: "ElevationMap", path: Path) -> None:
         MapError: The suffix names no kind of map file.
         StorageError: The system refused to write; nothing partial is left.
     """
-    _codec(path)[0](elevation, path)
+    by_suffix(path, _WRITERS, "map", MapError)(elevation, path)
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -52,19 +52,7 @@ def read(path: Path) -> dict[str, Any]:
         MapError: The file is missing, cannot be read, is of another kind, corrupt or too large, or
             says too little, or something about its numbers that cannot be obeyed.
     """
-    load = _codec(path)[1]
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise MapError(f"{path} is a folder or a device: give the path of a map file")
-        path.open("rb").close()
-    except FileNotFoundError:
-        raise MapError(f"there is no map file {path}: check the path") from None
-    except OSError as error:
-        raise MapError(f"cannot read {path}: {error.strerror}; check its permissions") from error
-    try:
-        return load(path)
-    except MapError as error:
-        raise MapError(f"{path}: {error}") from error
+    return read_file(path, _READERS, "map", MapError, _CURE)
 
 
 def _save_npz(elevation: "ElevationMap", path: Path) -> None:
@@ -72,46 +60,17 @@ def _save_npz(elevation: "ElevationMap", path: Path) -> None:
         np.savez_compressed(temporary, **{name: getattr(elevation, name) for name in _PARTS})
 
 
-@decoding
 def _load_npz(path: Path) -> dict[str, Any]:
-    with path.open("rb") as raw, zipfile.ZipFile(raw) as archive:
-        expected = sorted(f"{name}.npy" for name in _PARTS)
-        if sorted(archive.namelist()) != expected:
-            found = ", ".join(map(repr, archive.namelist()[:8])) or "nothing"
-            raise MapError(f"a map holds {', '.join(expected)}, this file holds {found[:300]}")
-        for name in expected:  # all of them, before memory is taken for one
-            with archive.open(name) as file:
-                shape, kind = _header(file)
-            wanted = "b" if name == "known.npy" else "fiu"
-            if kind.kind not in wanted or kind.itemsize > 8:
-                raise MapError(
-                    f"{name} holds {kind}, no {'truths' if wanted == 'b' else 'numbers'}"
-                )
-            check_cells(shape)
-        parts = {name: _array(archive, f"{name}.npy") for name in _PARTS}
+    def check(name: str, shape: tuple[int, ...], kind: np.dtype) -> None:
+        if kind.kind not in ("b" if name == "known" else "fiu") or kind.itemsize > 8:
+            wanted = "truths" if name == "known" else "numbers"
+            raise MapError(f"{name}.npy holds {kind}, no {wanted}")
+        check_cells(shape)
+
+    parts: dict[str, Any] = read_npz(path, _PARTS, check, MapError)
     if parts["resolution"].ndim or parts["origin"].shape != (2,):
         raise MapError("the resolution must be one number, and the origin two")
-    return parts | {
-        "resolution": float(parts["resolution"]),
-        "origin": tuple(float(value) for value in parts["origin"]),
-    }
-
-
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    """Return shape and type of a .npy file without its data."""
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):  # newer ones are for records with many or foreign names
-        raise MapError(f"the arrays are of version {version}: save them as plain numbers")
-    shape, _, kind = np.lib.format.read_array_header_1_0(file)
-    return shape, kind
-
-
-def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    with archive.open(name) as file:
-        array = np.lib.format.read_array(file, allow_pickle=False)
-        if file.read(1):  # at its end the checksum is compared
-            raise MapError(f"{name} is longer than it says")
-    return array
+    return parts | {name: parts[name].astype(float).tolist() for name in ("resolution", "origin")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +113,13 @@ def _save_png(elevation: "ElevationMap", path: Path) -> None:
 
 
 def _load_png(path: Path) -> dict[str, Any]:
-    notes = _read_sidecar(_sidecar(path))
+    sidecar = _sidecar(path)
+    if not sidecar.is_file():
+        raise MapError(
+            f"a PNG holds no metres: put scale, offset, resolution, origin and unknown in {sidecar}"
+        )
+    lines = read_file(sidecar, {".yaml": _lines}, "sidecar", MapError, _CURE)
+    notes = parse_record(Sidecar, lines, MapError, sidecar.name)
     with path.open("rb") as file:
         head = file.read(26)
     if len(head) == 26 and head[12:16] == b"IHDR":  # before Pillow takes memory
@@ -167,8 +132,8 @@ def _load_png(path: Path) -> dict[str, Any]:
             )
     if notes.picture not in (None, _digest(path)):
         raise MapError(
-            f"it is not the picture that {_sidecar(path).name} describes: write it again with "
-            "ElevationMap.save (or delete the line `picture`, if you changed it on purpose)"
+            f"it is not the picture that {sidecar.name} describes: {_CURE} (or delete the line "
+            "`picture`, if you changed it on purpose)"
         )
     values, clear = _picture(path)
 
@@ -180,7 +145,6 @@ def _load_png(path: Path) -> dict[str, Any]:
     return {"heights": heights, "resolution": notes.resolution, "origin": notes.origin}
 
 
-@decoding
 def _picture(path: Path) -> tuple[np.ndarray, int | None]:
     """Return the values of a grey picture, and which of them is transparent."""
     # Mapped, since a file takes memory for whatever length a chunk claims before it reads it.
@@ -195,24 +159,12 @@ def _picture(path: Path) -> tuple[np.ndarray, int | None]:
         return np.asarray(image), image.info.get("transparency")
 
 
-_COLOURS = {0: "grey", 2: "colours", 3: "a palette", 4: "grey and alpha", 6: "colours and alpha"}
-
-
-def _read_sidecar(path: Path) -> Sidecar:
-    if not path.is_file():
-        raise MapError(
-            f"a PNG holds no metres: put scale, offset, resolution, origin and unknown in {path}"
-        )
-    return parse_record(Sidecar, _notes(path), MapError, path.name)
-
-
-@decoding
-def _notes(path: Path) -> dict[str, Any]:
+def _lines(path: Path) -> dict[str, Any]:
     """Return what a small YAML file maps to what."""
     with path.open("rb") as file:
         text = file.read(_LARGEST_SIDECAR + 1)
     if len(text) > _LARGEST_SIDECAR:
-        raise MapError(f"{path.name} has more than {_LARGEST_SIDECAR} bytes")
+        raise MapError(f"it has more than {_LARGEST_SIDECAR} bytes")
     loader = yaml.SafeLoader(text)
     tree = loader.get_single_node()
     # Nothing within lists: parts that refer to parts could make a tree of a few lines endless.
@@ -221,11 +173,11 @@ def _notes(path: Path) -> dict[str, Any]:
         for _, node in tree.value
         for part in (node.value if isinstance(node, yaml.SequenceNode) else [node])
     ):
-        raise MapError(f"{path.name} must hold lines such as `scale: 0.001` and `origin: [0, 0]`")
-    notes = loader.construct_document(tree)
-    if len(tree.value) != len(notes):  # of two equal keys YAML takes the last
-        raise MapError(f"{path.name} gives a key twice")
-    return notes
+        raise MapError("it must hold lines such as `scale: 0.001` and `origin: [0, 0]`")
+    lines = loader.construct_document(tree)
+    if len(tree.value) != len(lines):  # of two equal keys YAML takes the last
+        raise MapError("it gives a key twice")
+    return lines
 
 
 def _digest(path: Path) -> str:
@@ -237,20 +189,15 @@ def _sidecar(path: Path) -> Path:
     return path.with_name(path.name + ".yaml")
 
 
-_CODECS = {
-    ".npz": (_save_npz, _load_npz),
-    ".tif": (save_geotiff, load_geotiff),
-    ".tiff": (save_geotiff, load_geotiff),
-    ".png": (_save_png, _load_png),
+_WRITERS = {
+    ".npz": _save_npz,
+    ".tif": save_geotiff,
+    ".tiff": save_geotiff,
+    ".png": _save_png,
 }
-
-
-def _codec(path: Path) -> tuple[Callable, Callable]:
-    """Return the functions that save and load files of this suffix."""
-    try:
-        return _CODECS[path.suffix.lower()]
-    except KeyError:
-        raise MapError(
-            f"{path} has {f'the suffix {path.suffix!r}' if path.suffix else 'no suffix'}; maps are "
-            f"{', '.join(_CODECS)} files"
-        ) from None
+_READERS = {
+    ".npz": _load_npz,
+    ".tif": load_geotiff,
+    ".tiff": load_geotiff,
+    ".png": _load_png,
+}

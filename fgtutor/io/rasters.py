@@ -1,23 +1,16 @@
-"""Pictures of heights: their rows to a map's columns and back, and what their readers raise.
+"""Pictures of heights: their rows to a map's columns and back.
 
 Images run row by row from north to south, maps [ix, iy] from south to north; only this file turns
 one into the other.
 """
 
-import re
 from collections.abc import Callable
-from functools import wraps
-from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fgtutor.errors import MapError
-
 if TYPE_CHECKING:
     from fgtutor.elevation import ElevationMap
-
-T = TypeVar("T")
 
 _STRIP = 2_000_000
 """Cells that are turned into metres at a time, which bounds the memory for numbers in between."""
@@ -51,26 +44,3 @@ def heights_of(
                 ::-1
             ].T
     return heights
-
-
-def decoding(load: Callable[[Path], T]) -> Callable[[Path], T]:
-    """Turn whatever the libraries raise on damaged files, which has no end, into a `MapError`."""
-
-    @wraps(load)
-    def loaded(path: Path) -> T:
-        try:
-            return load(path)
-        except MapError:
-            raise
-        except Exception as error:
-            problem = error
-        if isinstance(problem, OSError) and problem.strerror:
-            raise MapError(f"cannot be read: {problem.strerror}")
-        reason = re.sub(r"[^ -~]+", " ", f"{type(problem).__name__}: {problem}")[:200]
-        reason = reason.replace("Out of memory", "Too much memory for")  # libtiff's way to say no
-        raise MapError(
-            f"cannot be read as a {path.suffix} map ({reason}); the file is corrupt or of another "
-            "kind: write it again with ElevationMap.save"
-        )
-
-    return loaded
