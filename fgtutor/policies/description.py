@@ -1,8 +1,8 @@
-"""How a policy's network is written down and built again, without unpickling anything.
+"""A policy's architecture as plain values, so that it can be saved and rebuilt without pickle.
 
-Reads an rsl_rl policy and gives a `PolicyConfig` of plain values, or the other way round; the
-weights travel apart (`specialist`). What a file says chooses among names that stand here, and never
-names code itself. `register_policy` opens the list of classes.
+Reads an rsl_rl policy and gives a `PolicyConfig`, or the other way round; the weights are saved
+apart (`specialist`). A file can only choose among the names listed here, and never names code
+itself; `register_policy` adds a class to the list.
 """
 
 from dataclasses import asdict, dataclass
@@ -18,6 +18,7 @@ from torch import nn
 
 from fgtutor.errors import SpecialistError
 from fgtutor.io.validation import (
+    Ascending,
     Name,
     Positive,
     Unique,
@@ -56,13 +57,11 @@ class Noise:
 
     std_type: Literal["scalar", "log"]
     """Whether its parameter is the standard deviation or the logarithm of it."""
-    std_range: tuple[Positive, Positive]
+    std_range: Annotated[tuple[Positive, Positive], Ascending]
     """Least and greatest standard deviation, in action units."""
 
     def __post_init__(self) -> None:
         check_fields(self, SpecialistError)
-        if self.std_range[0] > self.std_range[1]:
-            raise SpecialistError(f"std_range: the least comes first, got {self.std_range}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,15 +1,15 @@
-"""DreamWaQ, the paper's training protocol: a policy without eyes that imagines what it walks on.
+"""DreamWaQ, the paper's training protocol: a blind policy that infers the terrain from its history.
 
-Reads the last few frames of what a blind robot feels. A context encoder estimates from them the
-body's velocity and a latent that says enough about the ground to predict the next frame; the policy
-acts on the newest frame and both. The critic, needed in training only, may know everything.
+Reads the last frames of proprioception. A context encoder estimates from them the body's velocity
+and a latent that says enough about the ground to predict the next frame; the policy acts on the
+newest frame and both. The critic, needed in training only, observes everything.
 Source: paper, Sec. IV; Nahrendra et al., "DreamWaQ: Learning Robust Quadrupedal Locomotion With
 Implicit Terrain Imagination via Deep Reinforcement Learning", ICRA 2023. Left out: its adaptive
 bootstrapping, which at times shows the policy the true velocity in training.
 """
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -46,7 +46,7 @@ class History:
         self.frames = torch.cat((self.frames[:, 1:], self.frames[:, :1]), dim=1)
 
     def see(self, frame: Float[Tensor, "envs width"]) -> Float[Tensor, "envs flat"]:
-        """Take `frame` for the newest, as often as anybody looks, and return all, oldest first."""
+        """Take `frame` for the newest, however often in a step; return all, oldest first."""
         self.frames[:, -1] = frame
         return self.frames.flatten(1).clone()
 
@@ -58,30 +58,22 @@ class ContextNet(nn.Module):
         self,
         width: int,
         *,
-        history: int = HISTORY,
-        latent: int = 16,
-        hidden: Sequence[int] = (128, 64),
+        history: int,
+        latent: int,
+        hidden: tuple[int, ...],
         mirror: Mirror | None = None,
     ) -> None:
-        """Build the encoder and the decoder that it is trained with.
+        """Build the encoder of `history` frames of `width` numbers, and its decoder.
 
-        Args:
-            width: Numbers in a frame.
-            history: Frames in a history.
-            latent: Width of the latent.
-            hidden: Widths of the encoder; the decoder mirrors them.
-            mirror: Left-right symmetry of the encoder, from `mirrors`.
+        `hidden` are the widths of the encoder, which the decoder mirrors; `mirror` is the encoder's
+        symmetry, from `mirrors`.
         """
         super().__init__()
         self.width, self.latent = width, latent
         self.encoder = SymmetricMLP(
-            history * width,
-            VELOCITY + 2 * latent,
-            mirror,
-            hidden_dims=list(hidden),
-            activation="elu",
+            history * width, VELOCITY + 2 * latent, mirror, hidden_dims=hidden, activation="elu"
         )
-        self.decoder = MLP(VELOCITY + latent, width, list(hidden)[::-1], "elu")
+        self.decoder = MLP(VELOCITY + latent, width, hidden[::-1], "elu")
 
     def forward(self, history: Float[Tensor, "*batch flat"]) -> Float[Tensor, "*batch features"]:
         """Return what the policy acts on; the latent is its mean, so that acting is repeatable."""
@@ -141,16 +133,10 @@ class DreamWaQModel(SymmetricMLPModel):
         mirror: Mirror | None = None,
         **kwargs: Any,
     ) -> None:
-        """Build encoder and policy.
+        """Build encoder and policy for `history` frames.
 
-        Args:
-            *args: What rsl_rl passes to every model.
-            history: Frames in the `history` group.
-            latent: Width of the encoder's latent.
-            context_hidden: Widths of the encoder.
-            mirror: How (velocity, frame) and the actions are mirrored; a policy built to be filled
-                with saved weights finds it there.
-            **kwargs: The same as `*args`, by name.
+        `mirror` is that of (velocity, frame) and the actions; a policy built to be filled with
+        saved weights finds it there.
 
         Raises:
             ConfigError: The observations are no `history` frames, or the latent cannot be halved.
@@ -163,7 +149,7 @@ class DreamWaQModel(SymmetricMLPModel):
             self.obs_dim // history,
             history=history,
             latent=latent,
-            hidden=context_hidden,
+            hidden=tuple(context_hidden),
             mirror=seen,
         )
 
@@ -212,19 +198,7 @@ def mirrors(mirror: Mirror, history: int, latent: int) -> tuple[Mirror, Mirror]:
     velocity = (index[:VELOCITY], sign[:VELOCITY])
     frame = ([i - VELOCITY for i in index[VELOCITY:]], sign[VELOCITY:])
     halves = ([*range(latent // 2, latent), *range(latent // 2)], [1.0] * latent)
-    frames, policy = join([frame] * history), join([frame, velocity, halves])
-    estimate = join([velocity, halves, halves])
     return (
-        Mirror(
-            observation_index=frames[0],
-            observation_sign=frames[1],
-            action_index=estimate[0],
-            action_sign=estimate[1],
-        ),
-        Mirror(
-            observation_index=policy[0],
-            observation_sign=policy[1],
-            action_index=mirror.action_index,
-            action_sign=mirror.action_sign,
-        ),
+        Mirror(*join([frame] * history), *join([velocity, halves, halves])),
+        Mirror(*join([frame, velocity, halves]), mirror.action_index, mirror.action_sign),
     )

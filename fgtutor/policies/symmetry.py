@@ -1,4 +1,4 @@
-"""Left-right symmetry: how a robot's mirror image sees and acts, and a policy that cannot limp.
+"""Left-right symmetry of a robot, and a policy that is symmetric by construction.
 
 Reads a robot's `Mirror`; gives an rsl_rl policy whose answer to a mirrored observation is exactly
 the mirrored answer. Source: network symmetry in Abdolhosseini et al., "On Learning Symmetric
@@ -6,7 +6,7 @@ Locomotion", MIG 2019.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from fgtutor.errors import ConfigError
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Mirror:
     """Reflection in the robot's plane y = 0: component i of the image is sign[i] * x[index[i]].
 
@@ -91,10 +91,7 @@ class SymmetricMLP(MLP):
         """
         super().__init__(inputs, outputs, **options)
         mirror = mirror or Mirror(
-            observation_index=tuple(range(inputs)),
-            observation_sign=(1.0,) * inputs,
-            action_index=tuple(range(outputs)),
-            action_sign=(1.0,) * outputs,
+            tuple(range(inputs)), (1.0,) * inputs, tuple(range(outputs)), (1.0,) * outputs
         )
         if (len(mirror.observation_index), len(mirror.action_index)) != (inputs, outputs):
             raise ConfigError(
@@ -102,28 +99,21 @@ class SymmetricMLP(MLP):
                 f"{len(mirror.action_index)} actions, the policy has {inputs} and {outputs}: take "
                 "the mirror of this robot"
             )
-        for name in ("observation_index", "action_index", "observation_sign", "action_sign"):
+        for name, values in vars(mirror).items():
             dtype = torch.long if name.endswith("index") else torch.float32
-            self.register_buffer(name, torch.tensor(getattr(mirror, name), dtype=dtype))
+            self.register_buffer(name, torch.tensor(values, dtype=dtype))
 
     def forward(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
         """Average the answer and the mirrored answer to the mirrored input."""
         # Two passes of one shape, not one of twice the rows: matrix kernels may round a row
         # differently at another place of the batch, and the symmetry is meant to be exact.
-        answer = self.plain(x)
-        twin = self.plain(x.index_select(-1, self.observation_index) * self.observation_sign)
+        answer = super().forward(x)
+        twin = super().forward(x.index_select(-1, self.observation_index) * self.observation_sign)
         return 0.5 * (answer + twin.index_select(-1, self.action_index) * self.action_sign)
 
     def find_mirror(self) -> Mirror:
         """Return the mirror; raises `ConfigError` if the state that was loaded holds none."""
-        names = ("observation_index", "observation_sign", "action_index", "action_sign")
-        return Mirror(**{name: tuple(getattr(self, name).tolist()) for name in names})
-
-    def plain(self, x: Tensor) -> Tensor:
-        """Return the answer of the network as it is."""
-        for layer in self:
-            x = layer(x)
-        return x
+        return Mirror(**{f.name: tuple(getattr(self, f.name).tolist()) for f in fields(Mirror)})
 
 
 class SymmetricMLPModel(MLPModel):
