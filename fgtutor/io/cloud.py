@@ -4,6 +4,7 @@ Reads arrays; gives a `Cloud`, or a `CloudError` that says why the numbers are n
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,6 +109,24 @@ def check_count(found: int, promised: int) -> None:
             f"the file has more points than its header says, {found} instead of {promised}: "
             "correct the header, or export it again"
         )
+
+
+def axes_of(names: Sequence[str]) -> list[int]:
+    """Return where x, y and z stand in a table; raises `CloudError` unless each is there once."""
+    if any(names.count(axis) != 1 for axis in "xyz"):
+        lacks = ", ".join(axis for axis in "xyz" if axis not in names) or "one of each"
+        raise CloudError(
+            f"the points have {', '.join(names)[:60]!r}, without {lacks}: expected each of x, y "
+            "and z once"
+        )
+    return [names.index(axis) for axis in "xyz"]
+
+
+def read_rows(data: bytes, at: int, count: int, row: np.dtype) -> tuple[np.ndarray, int]:
+    """Return the table of `count` rows that begins at a byte, and how many bytes follow it."""
+    check_count(min(max(len(data) - at, 0) // row.itemsize, count), count)
+    table = np.frombuffer(data, row, count, min(at, len(data)))
+    return table, len(data) - at - table.nbytes
 
 
 def whole_number(text: str, what: str) -> int:

@@ -14,7 +14,16 @@ import lzf
 import numpy as np
 
 from fgtutor.errors import CloudError
-from fgtutor.io.cloud import Cloud, check_claim, check_count, cloud_of, note, whole_number
+from fgtutor.io.cloud import (
+    Cloud,
+    axes_of,
+    check_claim,
+    check_count,
+    cloud_of,
+    note,
+    read_rows,
+    whole_number,
+)
 from fgtutor.io.xyz import read_table
 
 _LONGEST_HEADER = 2**20
@@ -43,46 +52,41 @@ def read_pcd(path: Path) -> Cloud:
             f"{len(counts)} COUNT"
         )
     repeats = [whole_number(text, "COUNT") for text in counts]
-    where = [fields.index(axis) for axis in "xyz" if fields.count(axis) == 1]
-    kinds = [f"{types[i].upper()}{sizes[i]}" for i in where]
-    if len(where) != 3:
-        shown = ", ".join(fields)[:60]
-        lacks = ", ".join(axis for axis in "xyz" if axis not in fields)
-        raise CloudError(f"the fields are {shown!r}, without {lacks or 'one of each'} of x, y, z")
-    if any(repeats[i] != 1 for i in where) or not {*kinds} <= _TYPES:
+    where = dict(zip(axes_of(fields), "xyz", strict=True))
+    kinds = {i: f"{types[i].upper()}{sizes[i]}" for i in where}
+    if any(repeats[i] != 1 for i in where) or not {*kinds.values()} <= _TYPES:
         several = ", ".join(str(repeats[i]) for i in where)
         raise CloudError(
             f"x, y and z should be one number each, the header gives them TYPE and SIZE "
-            f"{', '.join(kinds)[:40]!r} and COUNT {several}"
+            f"{', '.join(kinds.values())[:40]!r} and COUNT {several}"
         )
-    points = _points(header)
-    before = [sum(repeats[:i]) for i in where]
-    notes = _viewpoint(header)
+    points, notes = _points(header), _viewpoint(header)
     form = "".join(header["DATA"]).lower()
     if form == "ascii":
         lines = io.TextIOWrapper(io.BytesIO(data[start:]), "latin-1")
         number = len(data[:start].splitlines()) + 1
-        table = read_table(lines, number, before, sum(repeats))
+        table = read_table(lines, number, [sum(repeats[:i]) for i in where], sum(repeats))
         check_count(len(table), points)
         return cloud_of(table, notes=notes)
-    widths = [whole_number(s, "SIZE") * n for s, n in zip(sizes, repeats, strict=True)]
-    offsets, size = [sum(widths[:i]) for i in where], sum(widths)
-    layout = [np.dtype("<" + kind.lower()) for kind in kinds]
+    # Other fields are so many bytes, whatever their type.
+    widths = [f"V{whole_number(s, 'SIZE') * n}" for s, n in zip(sizes, repeats, strict=True)]
+    row = np.dtype(
+        [
+            (where[i], f"<{kinds[i].lower()}") if i in where else ("", width)
+            for i, width in enumerate(widths)
+        ]
+    )
     if form == "binary":
-        check_count(min((len(data) - start) // size, points), points)
-        row = np.dtype(
-            {"names": list("xyz"), "formats": layout, "offsets": offsets, "itemsize": size}
-        )
-        table = np.frombuffer(data, row, points, start)
-        notes += note(len(data) - start - table.nbytes, "byte", " after the last point")
-        return cloud_of(table, notes=notes)
+        table, rest = read_rows(data, start, points, row)
+        return cloud_of(table, notes=notes + note(rest, "byte", " after the last point"))
     if form != "binary_compressed":
         raise CloudError(f"DATA is {form[:40]!r}, expected ascii, binary or binary_compressed")
-    raw = _unpacked(data, start, size * points)
+    raw = _unpacked(data, start, row.itemsize * points)
     # Here all values of a field come before those of the next.
-    table = np.empty(points, [(axis, kind) for axis, kind in zip("xyz", layout, strict=True)])
-    for axis, kind, offset in zip("xyz", layout, offsets, strict=True):
-        table[axis] = np.frombuffer(raw, kind, points, points * offset)
+    table = np.empty(points, [(axis, row[axis]) for axis in "xyz"])
+    for axis in "xyz":
+        offset: int = row.fields[axis][1]  # pyright: ignore[reportOptionalSubscript]
+        table[axis] = np.frombuffer(raw, row[axis], points, points * offset)
     return cloud_of(table, notes=notes)
 
 

@@ -5,7 +5,6 @@ Reads .ply; gives coordinates. Source: Turk, "The PLY Polygon File Format" (1994
 
 import io
 import re
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import islice
@@ -14,26 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from fgtutor.errors import CloudError
-from fgtutor.io.cloud import Cloud, check_count, cloud_of, note, whole_number
+from fgtutor.io.cloud import Cloud, axes_of, check_count, cloud_of, note, read_rows, whole_number
 from fgtutor.io.xyz import read_table
 
 _LONGEST_HEADER = 2**20
-_TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{
-        "float": "f4",
-        "double": "f8",
-        "float32": "f4",
-        "float64": "f8",
-        "int8": "i1",
-        "uint8": "u1",
-    },
-    **{"int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8"},
-}
-_CODES = {
-    **{"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"},
-    **{"f4": "f", "f8": "d"},
-}
+_NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
+_KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+_TYPES: dict[str, str] = dict(zip(_NAMES, _KINDS, strict=True))
+_TYPES |= {np.dtype(kind).name: kind for kind in (*_KINDS, "i8", "u8")}
+"""What a PLY file calls a type, and what numpy does."""
 
 
 @dataclass
@@ -61,18 +49,14 @@ def read_ply(path: Path) -> Cloud:
     """
     data = path.read_bytes()
     form, elements, start = _header(data)
-    vertex = next((element for element in elements if element.name == "vertex"), None)
-    if vertex is None:
+    order = [element.name for element in elements]
+    if "vertex" not in order:
         raise CloudError("the PLY file has no vertices: it holds no points")
-    names = [name for name, _, _ in vertex.properties]
-    where = [names.index(axis) for axis in "xyz" if names.count(axis) == 1]
-    if len(where) != 3 or any(vertex.properties[i][2] for i in where):
-        shown = ", ".join(names)[:60]
-        raise CloudError(f"the vertices have {shown!r}, expected each of x, y and z once")
-    before = elements[: elements.index(vertex)]
-    last = vertex is elements[-1]
+    *before, vertex = elements[: order.index("vertex") + 1]
+    where = axes_of(["list" if length else name for name, _, length in vertex.properties])
     read = _read_ascii if form == "ascii" else _read_binary
     points, left = read(data, start, before, vertex, where, form)
+    last = vertex is elements[-1]
     return cloud_of(points, notes=note(left, "byte", " after the last vertex") if last else ())
 
 
@@ -114,7 +98,7 @@ def _read_binary(
 
     def take(kind: str) -> float:
         nonlocal at
-        (value,) = struct.unpack_from(order + _CODES[kind], data, at)
+        (value,) = np.frombuffer(data, order + kind, 1, at).tolist()
         at += int(kind[1])
         return value
 
@@ -125,19 +109,9 @@ def _read_binary(
             at += element.count * element.size
     if vertex.size is None:
         return _walk(vertex, take)[:, where], len(data) - at
-    room = max(len(data) - at, 0) // vertex.size
-    check_count(min(room, vertex.count), vertex.count)
-    starts = np.cumsum([0, *(int(kind[1]) for _, kind, _ in vertex.properties)])
-    row = np.dtype(
-        {
-            "names": list("xyz"),
-            "formats": [order + vertex.properties[i][1] for i in where],
-            "offsets": [int(starts[i]) for i in where],
-            "itemsize": vertex.size,
-        }
-    )
-    table = np.frombuffer(data, row, vertex.count, min(at, len(data)))
-    return table, len(data) - at - table.nbytes
+    kinds = [order + kind for _, kind, _ in vertex.properties]
+    names = ["xyz"[where.index(i)] if i in where else "" for i in range(len(kinds))]
+    return read_rows(data, at, vertex.count, np.dtype(list(zip(names, kinds, strict=True))))
 
 
 def _read_ascii(
@@ -170,7 +144,7 @@ def _walk(element: _Element, take: Callable[[str], float]) -> np.ndarray:
                         take(kind)
                 row.append(0.0 if length else take(kind))
             rows.append(row)
-    except (struct.error, StopIteration, ValueError, OverflowError) as error:
+    except (StopIteration, ValueError, OverflowError) as error:
         raise CloudError(
             f"{element.name[:40]!r} {len(rows) + 1} of {element.count} is cut off or no number: "
             "copy the file again"
