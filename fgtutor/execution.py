@@ -23,7 +23,7 @@ from fgtutor.io.validation import Count, Unbounded, check_fields
 from fgtutor.planning import Route
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.robots.commands import LOOKAHEAD
+from fgtutor.robots.crossings import LOOKAHEAD
 from fgtutor.specialist import Specialist
 from fgtutor.world.terrain import Terrain, World
 
@@ -207,8 +207,6 @@ class _Drive:
         self.error = np.zeros((n, 2))
         self.active = np.array([track.policy for track in self.tracks])
         self.waiting = np.zeros(n, dtype=int)
-        env.row = torch.zeros(n, dtype=torch.long)
-        env.column = tiles
         starts = [
             (
                 *(track.points[0] + corner + config.start_noise * dice.standard_normal(2)),
@@ -218,7 +216,7 @@ class _Drive:
             for track, corner, dice in zip(self.tracks, self.corners, self.dice, strict=True)
         ]
         poses = torch.tensor(np.array(starts), dtype=torch.float32)
-        env.start(torch.arange(n), poses, speed)
+        env.start(torch.arange(n), poses, speed, columns=tiles)
 
     def run(self, record_body: bool, progress: bool) -> list[Episode]:
         """Step until every robot has reached its goal, fallen or run out of time."""

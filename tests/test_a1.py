@@ -39,10 +39,10 @@ def still(env):
 @torch.inference_mode()
 def drive(env, steps=30, seed=0, vigour=0.5):
     """Act at random, but the same at every call; return everything the environment said."""
-    dice = torch.Generator().manual_seed(seed)
+    rng = torch.Generator().manual_seed(seed)
     said = []
     for _ in range(steps):
-        actions = vigour * torch.randn(env.num_envs, 12, generator=dice)
+        actions = vigour * torch.randn(env.num_envs, 12, generator=rng)
         observations, reward, done, _ = env.step(actions)
         said += [observations["policy"], observations["tracking"], reward, done]
     return said
@@ -63,57 +63,54 @@ def test_a_slope_has_no_edge_and_a_ledge_has_one():
     np.testing.assert_allclose(_edges(groove[None])[0], [3, 2, 1, 1, 1, 2, 3])
 
 
-def test_in_training_who_turns_away_or_leaves_its_line_has_failed():
-    for train in (True, False):
-        env = make(
-            n=4, config=dataclasses.replace(A1_EPISODES, train=train, stuck_seconds=math.inf)
-        )
-        put(env, (1.0, 2.0, 0.0), (4.0, 2.0, 0.0), (4.0, 3.2, 0.0), (6.0, 2.0, 0.0))
-        env.crossing[:] = True
-        env.crossing[1] = False  # nor does one that walks straight on from anywhere
-        env.aside[:] = 0.0
-        turned = env.pose.clone()
-        turned[0, 3] += math.radians(47)
-        turned[1, 3] -= math.radians(47)
-        turned[3, 3] -= math.radians(43)
-        assert env._strayed(turned).tolist() == [train, train, train, False]
+def test_in_training_a_robot_that_turns_away_or_leaves_its_line_has_failed():
+    env = make(n=4, config=dataclasses.replace(A1_EPISODES, stuck_seconds=math.inf))
+    put(env, (1.0, 2.0, 0.0), (4.0, 2.0, 0.0), (4.0, 3.2, 0.0), (6.0, 2.0, 0.0))
+    env.crossings.crossing[:] = True
+    env.crossings.crossing[1] = False  # nor may one that walks straight on from anywhere
+    env.crossings.aside[:] = 0.0
+    turned = env.pose.clone()
+    turned[0, 3] += math.radians(47)
+    turned[1, 3] -= math.radians(47)
+    turned[3, 3] -= math.radians(43)
+    assert env.crossings.strayed(turned).tolist() == [True, True, True, False]
 
 
 def test_a_new_heading_must_be_followed_at_some_rate():
     env = make(n=1, config=dataclasses.replace(A1_EPISODES, train=True, turn_share=0.0))
     put(env, (4.0, 2.0, 0.0))
-    env.turning[:], env.crossing[:] = False, False
-    env.target_yaw += math.pi / 2
+    env.crossings.turning[:], env.crossings.crossing[:] = False, False
+    env.crossings.target_yaw += math.pi / 2
     stays = env.pose.clone()
     steps = 0
-    while not env._strayed(stays).any():
-        env._steer()
+    while not env.crossings.strayed(stays).any():
+        env.crossings.headings(env.pose, env.control_dt)
         steps += 1
     # 45 degrees at 0.5 times 1 rad/s.
     assert steps * env.control_dt == pytest.approx(math.radians(45) / 0.5, abs=0.05)
 
 
-def test_who_turns_faster_than_expected_has_not_strayed():
+def test_a_robot_that_turns_faster_than_expected_has_not_strayed():
     env = make(n=2, config=dataclasses.replace(A1_EPISODES, train=True, turn_share=0.0))
     put(env, (4.0, 2.0, 0.0), (4.0, 2.0, 0.0))
-    env.turning[:], env.crossing[:] = False, False
-    env.target_yaw += math.pi / 2
-    env._steer()
+    env.crossings.turning[:], env.crossings.crossing[:] = False, False
+    env.crossings.target_yaw += math.pi / 2
+    env.crossings.headings(env.pose, env.control_dt)
     # Nearly there at once; the other turned away as far.
     env.pose[:, 3] = torch.tensor([1.2, -1.2])
-    env._steer()
-    assert env._strayed(env.pose).tolist() == [False, True]
-    assert env.told_yaw.tolist() == pytest.approx([1.2, 0.02], abs=0.01)
+    env.crossings.headings(env.pose, env.control_dt)
+    assert env.crossings.strayed(env.pose).tolist() == [False, True]
+    assert env.crossings.told_yaw.tolist() == pytest.approx([1.2, 0.02], abs=0.01)
     env.pose[:, 3] = math.pi / 2 + 0.3  # beyond the heading wanted: that is not further
-    env._steer()
-    assert env.told_yaw[0].item() == pytest.approx(1.21, abs=0.01)
+    env.crossings.headings(env.pose, env.control_dt)
+    assert env.crossings.told_yaw[0].item() == pytest.approx(1.21, abs=0.01)
 
 
 def test_velocity_counts_along_the_heading_told():
     for train, expected in ((True, [[0.0, 0.6], [0.6, 0.0]]), (False, [[0.6, 0.0]] * 2)):
         env = make(n=2, config=dataclasses.replace(A1_EPISODES, train=train))
         put(env, (2.0, 2.0, math.pi / 2), (4.0, 2.0, 1.0))
-        env.told_yaw[:] = torch.tensor([0.0, 1.0])  # the first walks off to the left
+        env.crossings.told_yaw[:] = torch.tensor([0.0, 1.0])  # the first walks off to the left
         velocity = torch.tensor([[0.6, 0.0, 0.0]] * 2)
         along = env.along_heading(env.pose, velocity)
         torch.testing.assert_close(along, torch.tensor(expected), atol=1e-4, rtol=0)
@@ -210,8 +207,8 @@ def test_velocity_is_in_the_yaw_frame_and_the_body_frame():
 def test_patches_equal_sample_patches(name):
     terrain = make_terrain(name, robot="a1", difficulty=1.0, seed=3)
     env = make(terrain, n=8)
-    dice = np.random.default_rng(0)
-    poses = [(dice.uniform(1, 7), dice.uniform(1, 3), dice.uniform(-3, 3)) for _ in range(8)]
+    rng = np.random.default_rng(0)
+    poses = [(rng.uniform(1, 7), rng.uniform(1, 3), rng.uniform(-3, 3)) for _ in range(8)]
     put(env, *poses)
     here = env.motion()[0][:, [0, 1, 3]]
     world = sample_patches(env.heights, here, A1_GRID, resolution=env.resolution, origin=env.origin)

@@ -98,9 +98,9 @@ def test_link_lengths_put_the_feet_where_they_belong(model):
 
 
 def test_mirrored_joints_mirror_the_feet(model):
-    data, dice = in_stance(model), np.random.default_rng(0)
+    data, rng = in_stance(model), np.random.default_rng(0)
     ranges = np.array([model.joint(name).range for name in a1_model.JOINTS])
-    angles = dice.uniform(ranges[:, 0], ranges[:, 1])
+    angles = rng.uniform(ranges[:, 0], ranges[:, 1])
     feet = []
     for q in (angles, angles[list(a1_model.MIRROR)] * a1_model.MIRROR_SIGNS):
         data.qpos[7:] = q
@@ -155,11 +155,11 @@ def test_a_lying_robot_reports_contacts_of_trunk_and_legs(model):
 
 
 def test_the_robot_never_collides_with_itself(model):
-    data, dice = in_stance(model), np.random.default_rng(1)
+    data, rng = in_stance(model), np.random.default_rng(1)
     ranges = np.array([model.joint(name).range for name in a1_model.JOINTS])
     data.qpos[2] = 5.0
     for _ in range(50):
-        data.qpos[7:] = dice.uniform(ranges[:, 0], ranges[:, 1])
+        data.qpos[7:] = rng.uniform(ranges[:, 0], ranges[:, 1])
         mujoco.mj_forward(model, data)
         assert data.ncon == 0
 

@@ -49,8 +49,8 @@ def test_the_ground_is_that_of_the_map_in_the_terrains_frame(name):
     terrain = waves() if name == "waves" else make_terrain(name, robot="a1", seed=3)
     # The line's one point, with the flag, stands in a corner, out of the way of the rays.
     model = a1_scene(terrain, np.array([[0.2, 0.2]]), [], **LOOK)
-    (nx, ny), dice = terrain.elevation.shape, np.random.default_rng(0)
-    for ix, iy in dice.integers((15, 15), (nx - 5, ny - 5), (60, 2)).tolist():
+    (nx, ny), rng = terrain.elevation.shape, np.random.default_rng(0)
+    for ix, iy in rng.integers((15, 15), (nx - 5, ny - 5), (60, 2)).tolist():
         x, y = terrain.elevation.centre_of(ix, iy)
         assert height_under(model, x, y) == pytest.approx(
             terrain.elevation.heights[ix, iy], abs=2e-3

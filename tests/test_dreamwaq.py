@@ -22,7 +22,7 @@ from fgtutor.policies.symmetry import Mirror
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.robots.a1.env import A1Env, A1EnvConfig
 from fgtutor.robots.a1.model import MIRROR, MIRROR_SIGNS
-from fgtutor.robots.commands import EnvConfig
+from fgtutor.robots.crossings import EnvConfig
 from fgtutor.robots.toy import ToyEnv
 from fgtutor.specialist import load_specialist, save_specialist
 from fgtutor.world.terrain import Terrain, World, make_terrain

@@ -28,10 +28,10 @@ def walk(history: int = 0) -> A1Env:
     world = World([[make_terrain("steps", robot="a1", seed=3)]])
     config = replace(A1Env.episodes, train=False, history=history)
     env = A1Env(world, 1, config=config)
-    dice = torch.Generator().manual_seed(0)
+    rng = torch.Generator().manual_seed(0)
     env.command[0] = torch.tensor((0.6, 0.0, -0.4))
     for _ in range(25):
-        env.step(torch.randn(1, 12, generator=dice))
+        env.step(torch.randn(1, 12, generator=rng))
     return env
 
 

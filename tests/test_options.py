@@ -15,7 +15,7 @@ from fgtutor.execution import FollowConfig
 from fgtutor.robots.a1.model import A1Config
 from fgtutor.robots.a1.observation import RewardWeights
 from fgtutor.robots.a1.randomise import A1EnvConfig
-from fgtutor.robots.commands import EnvConfig
+from fgtutor.robots.crossings import EnvConfig
 from fgtutor.robots.lidar import LidarConfig
 from fgtutor.robots.toy import ToyModel
 from fgtutor.world.obstacles import TerrainScale

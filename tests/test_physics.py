@@ -19,8 +19,8 @@ def model():
 
 def controls(step):
     """Give every simulation its own shaky controls, the same whenever they are asked for."""
-    dice = np.random.default_rng(step)
-    return torch.tensor(a1_model.STANCE) + torch.from_numpy(dice.uniform(-0.4, 0.4, (SIMS, 12)))
+    rng = np.random.default_rng(step)
+    return torch.tensor(a1_model.STANCE) + torch.from_numpy(rng.uniform(-0.4, 0.4, (SIMS, 12)))
 
 
 def place(physics):
@@ -124,10 +124,10 @@ def test_reset_touches_only_the_simulations_named(model):
     assert not physics.qvel[4].any()
     others = torch.tensor([0, 2, 3, 5])
     assert torch.equal(physics.qpos[others], before[0][others])
-    nobody = torch.tensor([], dtype=torch.long)
-    physics.reset(nobody)
-    physics.forward(nobody)
-    physics.set_const(nobody)
+    none = torch.tensor([], dtype=torch.long)
+    physics.reset(none)
+    physics.forward(none)
+    physics.set_const(none)
     assert torch.equal(physics.qpos[others], before[0][others])
 
 
@@ -157,7 +157,7 @@ def test_an_explosion_stays_in_its_simulation(model, field, value, tmp_path, mon
     healthy.reset(torch.tensor([3]))
     assert hurt.exploded().tolist() == []
     assert same(drive(healthy, 3), drive(hurt, 3))
-    # MuJoCo would otherwise leave a log file in the working directory of whoever trains.
+    # MuJoCo would otherwise leave a log file in the working directory.
     assert not list(tmp_path.iterdir())
 
 

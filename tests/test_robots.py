@@ -10,8 +10,7 @@ from fgtutor.errors import ConfigError
 from fgtutor.feasibility import tracking_reward
 from fgtutor.patches import sample_patches
 from fgtutor.robots import ROBOTS, env_class
-from fgtutor.robots.base import UNTRIED
-from fgtutor.robots.commands import EnvConfig, slowdown, turn_rate
+from fgtutor.robots.crossings import UNTRIED, EnvConfig, slowdown, turn_rate
 from fgtutor.world.terrain import World, make_terrain
 
 robots = pytest.mark.parametrize("robot", sorted(ROBOTS))
@@ -43,7 +42,7 @@ def test_turn_rate_takes_the_shorter_way_within_the_limit():
     assert turn_rate(wanted, yaw, 1.5).tolist() == pytest.approx([-0.6, 0.3, 1.5], abs=1e-5)
 
 
-def test_who_must_turn_far_slows_down_by_the_cosine_squared():
+def test_a_robot_that_must_turn_far_slows_down_by_the_cosine_squared():
     wanted = torch.tensor([0.5, 0.5 + math.pi / 4, 0.5 - math.pi / 2, 0.5 + math.pi])
     yaw = torch.tensor([0.5, 0.5, 0.5, 0.5 + 4 * math.pi])
     assert slowdown(wanted, yaw, 0.25).tolist() == pytest.approx([1.0, 0.5, 0.25, 0.25], abs=1e-5)
@@ -173,23 +172,23 @@ def test_between_neighbours_robots_stay_off_them(robot):
     env = env_class(robot)(World([[terrain]]), 256, config=EnvConfig())
     x = env.motion()[0][:, 0] - env.tile_corner(torch.arange(256))[:, 0]
     assert ((terrain.limits[0] < x) & (x < terrain.limits[1])).all()
-    backwards = torch.cos(env.target_yaw) < 0
-    assert torch.allclose(x[env.crossing & ~backwards], torch.tensor(terrain.start[0]))
-    assert torch.allclose(x[env.crossing & backwards], torch.tensor(terrain.goal[0]))
+    backwards = torch.cos(env.crossings.target_yaw) < 0
+    assert torch.allclose(x[env.crossings.crossing & ~backwards], torch.tensor(terrain.start[0]))
+    assert torch.allclose(x[env.crossings.crossing & backwards], torch.tensor(terrain.goal[0]))
     poses = env.motion()[0].clone()
     poses[:4, 0] += torch.tensor([terrain.limits[k] + s for k in (0, 1) for s in (-0.01, 0.01)])
     poses[:4, 0] -= x[:4]
-    outside, strange = env._outside(poses)
+    outside, strange = env.crossings.outside(poses)
     assert outside.nonzero().flatten().tolist() == strange.nonzero().flatten().tolist() == [0, 3]
 
 
 @robots
 def test_between_neighbours_crossings_begin_with_all_feet_on_the_landing(robot):
-    """Who is put down with a foot over a stranger's chasm has failed before doing anything."""
+    """A foot over the next tile's chasm would be a failure before the first step."""
     row = [make_terrain("steps", robot=robot, seed=seed, neighbours=True) for seed in range(8)]
     config = EnvConfig(train=False, start_yaw=0.8)
     env = env_class(robot)(World([row]), 256, config=config)
-    crossing, fell = env.crossing.clone(), torch.zeros(256, dtype=torch.bool)
+    crossing, fell = env.crossings.crossing.clone(), torch.zeros(256, dtype=torch.bool)
     for _ in range(round(0.4 / env.control_dt)):
         fell |= env.step(torch.zeros(256, env.num_actions))[3]["fell"]
     assert not (fell & crossing).any()
@@ -199,8 +198,8 @@ def test_between_neighbours_crossings_begin_with_all_feet_on_the_landing(robot):
 def test_crossings_begin_anywhere_up_to_their_run_up(robot):
     terrain = make_terrain("bridge", robot=robot, seed=3)
     env = env_class(robot)(World([[terrain]]), 512, config=EnvConfig(run_up=0.6))
-    x = (env.motion()[0][:, 0] - env.tile_corner(torch.arange(512))[:, 0])[env.crossing]
-    forwards = torch.cos(env.target_yaw[env.crossing]) > 0
+    x = (env.motion()[0][:, 0] - env.tile_corner(torch.arange(512))[:, 0])[env.crossings.crossing]
+    forwards = torch.cos(env.crossings.target_yaw[env.crossings.crossing]) > 0
     for side, last in (
         (x[forwards], terrain.span[0] - 0.6),
         (-x[~forwards], -terrain.span[1] - 0.6),
@@ -212,7 +211,7 @@ def test_crossings_begin_anywhere_up_to_their_run_up(robot):
 
 @robots
 def test_going_on_to_a_neighbours_obstacle_is_infeasible_but_no_fault(robot):
-    """Nobody knows what would happen there, so it must not look feasible; PPO sees a time-out."""
+    """What would happen there is unknown, so it must not look feasible; PPO sees a time-out."""
     terrain = make_terrain("gaps", robot=robot, seed=3, neighbours=True)
     assert terrain.limits is not None
     env = env_class(robot)(World([[terrain]]), 2, config=EnvConfig(train=False))
@@ -229,12 +228,12 @@ def test_going_on_to_a_neighbours_obstacle_is_infeasible_but_no_fault(robot):
 def test_crossings_begin_askew_towards_their_lane(robot):
     terrain = make_terrain("bridge", robot=robot, seed=3)
     env = env_class(robot)(World([[terrain]]), 512, config=EnvConfig(start_yaw=0.8))
-    across = env.crossing
-    ahead = torch.where(torch.cos(env.target_yaw) > 0, 0.0, math.pi)
-    angle = torch.remainder(env.target_yaw - ahead + math.pi, 2 * math.pi) - math.pi
+    across = env.crossings.crossing
+    ahead = torch.where(torch.cos(env.crossings.target_yaw) > 0, 0.0, math.pi)
+    angle = torch.remainder(env.crossings.target_yaw - ahead + math.pi, 2 * math.pi) - math.pi
     assert 0.6 < angle[across].abs().max() < 0.81
-    # Seen along the way, who stands left of the lane heads to the right.
-    left = env._beside_lane(env.motion()[0]) + env.aside
+    # Seen along the way, a robot left of the lane heads to the right.
+    left = env.crossings.beside_lane(env.motion()[0]) + env.crossings.aside
     left = left * torch.cos(ahead)
     steep = across & (angle.abs() > 0.16) & (left.abs() > 0.01)
     assert steep.sum() > 100 and (torch.sign(angle) == -torch.sign(left))[steep].all()
@@ -244,18 +243,19 @@ def test_crossings_begin_askew_towards_their_lane(robot):
 def test_the_curriculum_follows_the_tracking_reward(robot):
     tiles = [[make_terrain("flat", robot=robot, seed=2)] for _ in range(3)]
     env = env_class(robot)(World(tiles), 7, config=EnvConfig())
-    env.row = torch.tensor([1, 1, 1, 1, 1, 1, 2])
-    env.episode_length_buf[:] = 10
-    env.return_r_v = torch.tensor([9.0, 9.0, 9.0, 4.0, 9.0, 9.0, 9.0])
+    env.crossings.row = torch.tensor([1, 1, 1, 1, 1, 1, 2])
+    mean = torch.tensor([0.9, 0.9, 0.9, 0.4, 0.9, 0.9, 0.9])
     failed = torch.tensor([False, True, True, False, False, True, False])
     way = torch.tensor([0.9, 0.2, 0.7, 0.9, 0.1, 0.2, 0.9])
-    env.begin[:] = env.motion()[0][:, :2]
-    env.begin[:, 0] -= way * env.tile_size[0]
-    env.crossing[:] = torch.arange(7) != 5
-    env._promote(torch.arange(7), failed)
+    here = env.motion()[0][:, :2]
+    env.crossings.begin[:] = here
+    env.crossings.begin[:, 0] -= way * env.crossings.tile_size[0]
+    env.crossings.crossing[:] = torch.arange(7) != 5
+    env.crossings.promote(torch.arange(7), mean, here, failed)
+    row = env.crossings.row
     # Tracked well: up. Failed early: down. Failed late, tracked badly, soon over, or failed but was
     # not to cross the tile: stays. Tracked well on the last row: anywhere in the harder half.
-    assert env.row[:6].tolist() == [2, 0, 1, 1, 1, 1] and env.row[6] >= 1
+    assert row[:6].tolist() == [2, 0, 1, 1, 1, 1] and row[6] >= 1
 
 
 @robots
@@ -269,14 +269,13 @@ def test_a_crossing_is_steered_along_the_lane_at_its_distance(robot):
     places = torch.tensor([[(x0 + x1) / 2, beam + side, 0.0] for side in (-0.1, 0.0, 0.1)])
     places[:, :2] += corner
     env.start(torch.arange(3), places, 0.5)
-    env.crossing[:], env.aside[:] = True, 0.0
-    env._steer()
-    rates = env.command[:, 2]
+    env.crossings.crossing[:], env.crossings.aside[:] = True, 0.0
+    pose = env.motion()[0]
+    off = env.crossings.headings(pose, env.control_dt) - pose[:, 3]
     # To the right of the beam's line: turn left; on it: straight on; to its left: turn right.
-    assert rates[0] > 0.1 and abs(rates[1]) < 0.05 and rates[2] < -0.1
-    env.aside[:] = 0.1
-    env._steer()
-    assert abs(env.command[2, 2]) < 0.05
+    assert off[0] > 0.1 and abs(off[1]) < 0.02 and off[2] < -0.1
+    env.crossings.aside[:] = 0.1
+    assert abs(env.crossings.headings(pose, env.control_dt)[2] - pose[2, 3]) < 0.02
 
 
 def test_an_unknown_robot_lists_the_known_ones():

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from fgtutor.elevation import ElevationMap
-from fgtutor.robots.commands import EnvConfig
+from fgtutor.robots.crossings import EnvConfig
 from fgtutor.robots.toy import LANE, ToyEnv, polyline
 from fgtutor.world.terrain import Terrain, World
 
@@ -21,7 +21,7 @@ def on(heights, poses, speed=0.8):
 
 
 def roll(env, seconds, action=(0.0, 0.0, 0.0, 0.0)):
-    """Drive with a constant action; return who fell on the way."""
+    """Drive with a constant action; return which robots fell on the way."""
     fell = torch.zeros(env.num_envs, dtype=torch.bool)
     for _ in range(round(seconds / env.control_dt)):
         *_, extras = env.step(torch.tensor(action).repeat(env.num_envs, 1))
@@ -117,14 +117,16 @@ def test_polyline_keeps_a_gentle_slope_smooth():
 
 
 @pytest.mark.parametrize("train", [True, False])
-def test_who_leaves_its_line_has_failed_and_on_a_route_there_is_no_line(train):
+def test_a_robot_off_its_line_has_failed_and_on_a_route_there_is_no_line(train):
     terrain = Terrain.from_elevation(ElevationMap(FLAT), (1, 1), (2, 1))
     env = ToyEnv(World([[terrain]]), 3, config=EnvConfig(train=train))
     poses = torch.tensor([(2.0, 1.5, 0.0)] * 3)
     poses[:, :2] += env.tile_corner(torch.arange(3))
     env.start(torch.arange(3), poses, 0.8)
-    env.anchor[1, 1] += 0.9  # its line lies 0.9 m to its left, the third's 1.1 m to its right
-    env.anchor[2, 1] -= 1.1
+    env.crossings.anchor[1, 1] += (
+        0.9  # its line lies 0.9 m to its left, the third's 1.1 m to its right
+    )
+    env.crossings.anchor[2, 1] -= 1.1
     env.step(torch.zeros(3, 4))
     assert env.tracking[:, 1].tolist() == [0.0, 0.0, float(train)]
     assert (env.tracking[:, 0] > 0).tolist() == [True, True, not train]

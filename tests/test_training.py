@@ -427,16 +427,18 @@ def test_the_first_row_rises_where_robots_have_outgrown_it_and_they_keep_their_d
     assert trainer.easiest == 0.2  # they stand on the first row
     trainer.iterate()
     trainer.history[-1]["row"] = 2.0
-    trainer.env.row[:] = torch.tensor([0, 2, 3, 4])
+    trainer.env.crossings.row[:] = torch.tensor([0, 2, 3, 4])
     trainer.save()
     # A quarter of what was missing: rows of 0.2, 0.4 .. 1 become 0.4, 0.55, 0.7, 0.85, 1.
     assert trainer.easiest == pytest.approx(0.4)
-    assert trainer.env.row.tolist() == [0, 1, 3, 4]
+    assert trainer.env.crossings.row.tolist() == [0, 1, 3, 4]
     first, *_, last = training_world(dataclasses.replace(config, easiest=0.4)).tiles
     assert (first[0].difficulty, last[0].difficulty) == (0.4, 1.0)
     again = Trainer(dataclasses.replace(config, resume=True))
     again.resume()
-    assert again.easiest == trainer.easiest and torch.equal(again.env.row, trainer.env.row)
+    assert again.easiest == trainer.easiest and torch.equal(
+        again.env.crossings.row, trainer.env.crossings.row
+    )
     for mine, theirs in zip(again.env.world.tiles, trainer.env.world.tiles, strict=True):
         assert [(t.seed, t.difficulty) for t in mine] == [(t.seed, t.difficulty) for t in theirs]
     for _ in range(9):

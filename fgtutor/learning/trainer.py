@@ -154,7 +154,7 @@ class Trainer:
             "seconds": self.seconds,
             **distributed.mean(
                 {
-                    "row": self.env.row.float().mean().item(),
+                    "row": self.env.crossings.row.float().mean().item(),
                     "easiest": self.easiest,
                     "std": self.algorithm.get_policy().output_std.mean().item(),
                     **self.algorithm.metrics,

@@ -1,27 +1,59 @@
-"""The robots: one seam (`base`), one file each (`toy`, `a1`), found by name.
+"""The table of robots: all that is known of a robot before its simulator is loaded.
 
-A robot's module is imported only when that robot is asked for, so the toy never loads MuJoCo and
-the A1 never loads pymunk.
+A robot is a file with a `LocomotionEnv` (`base` is all that its author reads) and an entry here.
+Its module is imported only when that robot is asked for, so the toy never loads MuJoCo and the A1
+never loads pymunk.
 """
 
 import importlib
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from fgtutor.errors import ConfigError
+from fgtutor.world.obstacles import SCALES, TerrainScale
 
 if TYPE_CHECKING:
     from fgtutor.robots.base import LocomotionEnv
 
-ROBOTS = {"toy": ("fgtutor.robots.toy", "ToyEnv"), "a1": ("fgtutor.robots.a1.env", "A1Env")}
-"""Robot name -> module and environment class. A third robot is one file and one entry here."""
-
 GL_BACKENDS = {"linux": ("egl", "osmesa"), "darwin": ("cgl",), "win32": ("wgl",)}
 """Values of MUJOCO_GL that can draw without a window, in the order of trying, by sys.platform."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Robot:
+    """One robot's entry."""
+
+    env: str
+    """Module and class of its environment, "module:Class"."""
+    scale: TerrainScale = field(default_factory=TerrainScale)
+    """Sizes of the terrains made for it, and which of them its mixed terrain holds."""
+    order: tuple[str, ...] = ()
+    """What follows what on the course of `evaluate switching`; default: as in `scale.mixed`."""
+
+    @property
+    def course(self) -> tuple[str, ...]:
+        """What follows what on the course of `evaluate switching`."""
+        return self.order or self.scale.mixed
+
+
+ROBOTS = {
+    "toy": Robot(
+        env="fgtutor.robots.toy:ToyEnv",
+        scale=SCALES["toy"],
+        order=("steps", "slopes", "steps", "gaps", "rubble", "steps"),
+    ),
+    "a1": Robot(
+        env="fgtutor.robots.a1.env:A1Env",
+        scale=SCALES["a1"],
+        order=("steps", "valley", "steps", "gaps", "bridge", "steps"),  # the paper's
+    ),
+}
+"""The robots by name."""
 
 
 def env_class(robot: str) -> "type[LocomotionEnv]":
     """Return a robot's environment class; raises `ConfigError` for an unknown robot."""
     if robot not in ROBOTS:
         raise ConfigError(f"unknown robot {robot!r}; choose one of {', '.join(sorted(ROBOTS))}")
-    module, name = ROBOTS[robot]
+    module, name = ROBOTS[robot].env.split(":")
     return getattr(importlib.import_module(module), name)

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from fgtutor.errors import CloudError, ConfigError
-from fgtutor.io.clouds import Points
+from fgtutor.io.cloud import Points
 from fgtutor.io.validation import (
     Ascending,
     NonNegative,

@@ -26,7 +26,7 @@ from torch import Tensor
 from fgtutor.io.validation import Ascending, NonNegative, Positive, check_fields
 from fgtutor.patches import PatchGrid, sample_heights
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.robots.commands import EnvConfig
+from fgtutor.robots.crossings import EnvConfig
 from fgtutor.world.terrain import World
 
 LANE = 1000.0

@@ -24,7 +24,7 @@
 
 # %%
 from fgtutor import make_terrain
-from fgtutor.robots.commands import EnvConfig
+from fgtutor.robots.crossings import EnvConfig
 from fgtutor.robots.toy import ToyEnv
 from fgtutor.world.terrain import World
 

@@ -79,8 +79,8 @@ class Drive:
         start = torch.tensor(self.terrain.start) + corner
         pose = torch.tensor([[start[0], start[1], self._yaw]], dtype=torch.float32)
         self.env.reset_all()
-        self.env.row[:], self.env.column[:] = 0, 0
-        self.env.start(torch.zeros(1, dtype=torch.long), pose, 0.0)
+        only = torch.zeros(1, dtype=torch.long)
+        self.env.start(only, pose, 0.0, columns=only)
         self.fallen = False
         """Whether the robot has fallen, after which it no longer moves."""
         self.r_v = 1.0

@@ -42,7 +42,7 @@ from fgtutor.robots.a1.observation import (
 from fgtutor.robots.a1.physics import Physics
 from fgtutor.robots.a1.randomise import A1EnvConfig, randomise
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.robots.commands import EnvConfig
+from fgtutor.robots.crossings import EnvConfig
 from fgtutor.world.terrain import World
 
 A1_GRID = PatchGrid(ahead=0.8, behind=0.8, half_width=0.5)
@@ -181,9 +181,9 @@ class A1Env(LocomotionEnv):
 
     def _push(self) -> None:
         """Change the velocity of a few robots, as a shove would."""
-        hit = self._uniform(self.num_envs) < self.control_dt / self.settings.push_seconds
+        hit = self.uniform(self.num_envs) < self.control_dt / self.settings.push_seconds
         if hit.any():
-            shove = self.settings.push_speed * (2 * self._uniform(self.num_envs, 2) - 1)
+            shove = self.settings.push_speed * (2 * self.uniform(self.num_envs, 2) - 1)
             self.physics.qvel[:, :2] += (shove * hit[:, None]).double().cpu()
 
     def _count_explosions(self, broken: Bool[Tensor, "envs"]) -> None:
@@ -285,7 +285,7 @@ class A1Env(LocomotionEnv):
             dim=-1,
         )
         if self.settings.noise:
-            features += self.noise * (2 * self._uniform(*features.shape) - 1)
+            features += self.noise * (2 * self.uniform(*features.shape) - 1)
         # What is about to explode must not reach the learner either.
         return (features * self.scale).clamp(-20.0, 20.0)
 
@@ -311,7 +311,7 @@ class A1Env(LocomotionEnv):
         side = (LOOK_GRID.shape[1] - columns) // 2
         heights = self.look[:, -rows:, side : side + columns].flatten(1) - self.pose[:, 2:3]
         if self.settings.noise:
-            heights += SCAN_NOISE * (2 * self._uniform(*heights.shape) - 1)
+            heights += SCAN_NOISE * (2 * self.uniform(*heights.shape) - 1)
         return SCAN_SCALE * (heights.clamp(-SCAN_LIMIT, SCAN_LIMIT) + STANCE_HEIGHT)
 
     def fallen(self) -> Bool[Tensor, "envs"]:
