@@ -14,7 +14,8 @@ import numpy as np
 
 import fgtutor
 from fgtutor.elevation import ElevationMap
-from fgtutor.world.terrain import SCALES, make_terrain
+from fgtutor.robots import ROBOTS
+from fgtutor.world.terrain import make_terrain
 
 RESOLUTION = 0.1
 WALL = 0.45  # m; more than twice the highest riser, less than what counts as a hole below it
@@ -23,7 +24,7 @@ TARGET = Path(fgtutor.__file__).parent / "zoo" / "maps" / "toy_mixed.npz"
 
 def obstacle(name: str, length: float, *, difficulty: float, seed: int) -> np.ndarray:
     """Return the heights of one obstacle, `length` metres long, over a terrain's full width."""
-    scale = SCALES["toy"]
+    scale = ROBOTS["toy"].scale
     scale = replace(scale, resolution=RESOLUTION, length=length + 2 * scale.apron)
     terrain = make_terrain(name, difficulty=difficulty, seed=seed, scale=scale)
     section = terrain.sections[0]

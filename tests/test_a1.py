@@ -10,10 +10,11 @@ from tensordict import TensorDict
 from fgtutor.elevation import ElevationMap
 from fgtutor.patches import prepare, sample_patches
 from fgtutor.policies.symmetry import SymmetricMLPModel
+from fgtutor.robots import ROBOTS
 from fgtutor.robots.a1 import observation
 from fgtutor.robots.a1.env import A1_EPISODES, A1_GRID, A1Env, A1EnvConfig, _edges
 from fgtutor.robots.a1.model import JOINT_RANGES, STANCE
-from fgtutor.world.terrain import SCALES, Terrain, World, make_terrain
+from fgtutor.world.terrain import Terrain, World, make_terrain
 
 STILL = dataclasses.replace(A1_EPISODES, train=False, stuck_seconds=math.inf)
 FLAT = make_terrain("flat", robot="a1")
@@ -236,7 +237,7 @@ def test_scan_sees_a_ledge_ahead_at_its_height_over_the_trunk():
 def test_scan_is_clamped_and_blind_to_how_deep_a_hole_is():
     scans = []
     for depth in (0.6, 1.5):
-        scale = dataclasses.replace(SCALES["a1"], chasm_depth=(depth, depth, depth))
+        scale = dataclasses.replace(ROBOTS["a1"].scale, chasm_depth=(depth, depth, depth))
         terrain = make_terrain("gaps", robot="a1", difficulty=1.0, seed=1, scale=scale)
         env = make(terrain, n=20)
         put(env, *[(0.5 + 0.05 * i, 2.0, 0.0) for i in range(20)])

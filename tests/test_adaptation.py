@@ -21,10 +21,10 @@ from fgtutor.evaluation.adaptation import (
     way_of,
 )
 from fgtutor.feasibility import FeasibilityNet
+from fgtutor.robots import ROBOTS
 from fgtutor.robots.a1.env import A1_GRID
 from fgtutor.robots.toy import TOY_GRID
 from fgtutor.specialist import ZOO, load_specialist, save_specialist
-from fgtutor.world.terrain import SCALES
 
 GRIDS = {"toy": TOY_GRID, "a1": A1_GRID}
 
@@ -69,7 +69,7 @@ def make_climber(make_specialist):
 
 @pytest.mark.parametrize("robot", ["toy", "a1"])
 def test_three_gates_in_a_wall_with_steps_of_three_heights(robot):
-    terrain, scale = make_map(robot, 1), SCALES[robot]
+    terrain, scale = make_map(robot, 1), ROBOTS[robot].scale
     ground = terrain.elevation
     assert ground.resolution == scale.resolution and ground.known.all()
     (x, y), (u, v) = terrain.start, terrain.goal

@@ -24,13 +24,15 @@ from fgtutor.evaluation.switching import (
 )
 from fgtutor.fusion import fuse
 from fgtutor.planning import plan
-from fgtutor.world.terrain import SCALES, make_terrain
+from fgtutor.robots import ROBOTS
+from fgtutor.world.terrain import make_terrain
 
 
 @pytest.fixture
 def config(zoo, monkeypatch):
     """A course of flat ground only, which rolling toys cross."""
-    monkeypatch.setitem(switching.ORDERS, "toy", ("flat", "flat"))
+    flat = replace(ROBOTS["toy"], order=("flat", "flat"))
+    monkeypatch.setitem(ROBOTS, "toy", flat)
     return SwitchingConfig(
         trials=2,
         courses=("flat-flat",),
@@ -52,13 +54,13 @@ def test_the_courses_are_the_papers_transitions():
         "gaps-rubble": ("gaps", "rubble"),
         "full": ("steps", "slopes", "steps", "gaps", "rubble", "steps"),
     }
-    for robot, order in switching.ORDERS.items():  # every terrain that a robot specialises in
-        assert set(order) == set(SCALES[robot].mixed)
+    for robot in ROBOTS.values():  # every terrain that a robot specialises in
+        assert set(robot.course) == set(robot.scale.mixed)
 
 
 @pytest.mark.parametrize("robot", ["toy", "a1"])
 def test_a_course_lays_what_it_is_asked_for(robot):
-    kinds = switching.ORDERS[robot]
+    kinds = ROBOTS[robot].course
     terrain = lay_course(kinds, robot=robot, seed=1)
     assert terrain.name == "-".join(kinds)
     assert [part.name for part in terrain.sections] == list(kinds)

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import OffMapError, TerrainError
 from fgtutor.patches import PatchGrid, prepare, sample_patches
+from fgtutor.robots import ROBOTS
 from fgtutor.world.terrain import (
-    SCALES,
     TERRAINS,
     Box,
     Terrain,
@@ -23,7 +23,6 @@ from fgtutor.world.terrain import (
     rasterise,
 )
 
-ROBOTS = tuple(SCALES)
 OBSTACLES = tuple(name for name in TERRAINS if name not in ("flat", "mixed"))
 angles = st.floats(-1.2, 1.2)
 lengths = st.floats(0.2, 1.5)
@@ -95,7 +94,7 @@ def _is_thin(box: Box, x: float, y: float) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 @pytest.mark.parametrize("name", TERRAINS)
 def test_terrain_maps_against_the_search(name: str, robot: str) -> None:
     terrain = make_terrain(name, robot=robot, seed=3)
@@ -135,14 +134,14 @@ def test_boxes_from_elevation_merges_and_respects_the_origin() -> None:
 # -- terrains --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 @pytest.mark.parametrize("name", TERRAINS)
 @pytest.mark.parametrize("difficulty", [0.0, 0.5, 1.0])
 def test_every_terrain_is_a_corridor_between_flat_aprons(
     name: str, robot: str, difficulty: float
 ) -> None:
     terrain = make_terrain(name, robot=robot, difficulty=difficulty, seed=1)
-    scale, elevation = SCALES[robot], terrain.elevation
+    scale, elevation = ROBOTS[robot].scale, terrain.elevation
     assert elevation.known.all()
     apron = round(scale.apron / elevation.resolution)
     assert not elevation.heights[:apron].any() and not elevation.heights[-apron:].any()
@@ -155,7 +154,7 @@ def test_every_terrain_is_a_corridor_between_flat_aprons(
     assert along == sorted(along) and all(elevation.contains(*point) for point in terrain.lane)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 @pytest.mark.parametrize("seed", range(5))
 def test_every_section_holds_its_obstacle_over_the_full_width(robot: str, seed: int) -> None:
     terrains = [make_terrain(name, robot=robot, seed=seed) for name in (*OBSTACLES, "mixed")]
@@ -166,17 +165,17 @@ def test_every_section_holds_its_obstacle_over_the_full_width(robot: str, seed: 
             if section.name != "bridge":  # whose beam is the way over
                 assert region.heights.any(axis=0).all(), f"there is a way around {section}"
     mixed = terrains[-1]
-    assert sorted(section.name for section in mixed.sections) == sorted(SCALES[robot].mixed)
+    assert sorted(section.name for section in mixed.sections) == sorted(ROBOTS[robot].scale.mixed)
     for left, right in zip(mixed.sections, mixed.sections[1:], strict=False):
         landing = mixed.elevation.crop(left.x1, 0.0, right.x0, left.y1)
-        assert landing.size[0] == pytest.approx(SCALES[robot].mixed_landing)
+        assert landing.size[0] == pytest.approx(ROBOTS[robot].scale.mixed_landing)
         assert not landing.heights.any()
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 @pytest.mark.parametrize("seed", range(4))
 def test_neighbours_are_other_obstacles_a_landing_away(robot: str, seed: int) -> None:
-    scale = SCALES[robot]
+    scale = ROBOTS[robot].scale
     for name in scale.mixed:
         terrain = make_terrain(name, robot=robot, seed=seed, neighbours=True)
         alone = make_terrain(name, robot=robot, seed=seed)
@@ -197,7 +196,7 @@ def test_neighbours_are_other_obstacles_a_landing_away(robot: str, seed: int) ->
         assert terrain.lane[0] == terrain.start and terrain.lane[-1] == terrain.goal
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 @pytest.mark.parametrize("name", (*OBSTACLES, "mixed"))
 def test_the_seed_fixes_the_terrain(name: str, robot: str) -> None:
     first, again, other = (make_terrain(name, robot=robot, seed=seed) for seed in (5, 5, 6))
@@ -207,7 +206,7 @@ def test_the_seed_fixes_the_terrain(name: str, robot: str) -> None:
     assert (first.elevation.heights != other.elevation.heights).any()
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 @pytest.mark.parametrize("name", OBSTACLES)
 @pytest.mark.parametrize("seed", range(3))
 def test_higher_difficulty_is_rougher(name: str, robot: str, seed: int) -> None:
@@ -224,18 +223,18 @@ def test_higher_difficulty_is_rougher(name: str, robot: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["steps", "gaps", "bridge", "rubble", "stairs"])
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 def test_upright_edges_lie_on_cell_borders(name: str, robot: str) -> None:
-    resolution = SCALES[robot].resolution
+    resolution = ROBOTS[robot].scale.resolution
     for box in make_terrain(name, robot=robot, difficulty=0.6, seed=2).boxes:
         for centre, size in zip(box.centre[:2], box.size[:2], strict=True):
             for edge in (centre - size / 2, centre + size / 2):
                 assert edge / resolution == pytest.approx(round(edge / resolution), abs=1e-6)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 def test_risers_by_measurement(robot: str) -> None:
-    lowest, highest = SCALES[robot].step_height
+    lowest, highest = ROBOTS[robot].scale.step_height
     for seed in range(5):
         heights = make_terrain("steps", robot=robot, seed=seed).elevation.heights
         risers = np.abs(np.diff(heights[:, heights.shape[1] // 2]))
@@ -243,10 +242,10 @@ def test_risers_by_measurement(robot: str) -> None:
         assert risers.max() >= lowest - 1e-5
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 @pytest.mark.parametrize(("difficulty", "depth"), [(0.0, 0), (0.7, 1), (1.0, 2)])
 def test_gaps_by_measurement(robot: str, difficulty: float, depth: int) -> None:
-    scale = SCALES[robot]
+    scale = ROBOTS[robot].scale
     for seed in range(5):
         terrain = make_terrain("gaps", robot=robot, difficulty=difficulty, seed=seed)
         heights = terrain.elevation.heights
@@ -260,11 +259,11 @@ def test_gaps_by_measurement(robot: str, difficulty: float, depth: int) -> None:
         assert (np.diff(edges)[1::2] * scale.resolution >= scale.platform[0] - 1e-6).all()
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 @pytest.mark.parametrize("seed", range(4))
 def test_bridge_by_measurement(robot: str, seed: int) -> None:
     terrain = make_terrain("bridge", robot=robot, seed=seed)
-    (section,), scale = terrain.sections, SCALES[robot]
+    (section,), scale = terrain.sections, ROBOTS[robot].scale
     region = terrain.elevation.crop(section.x0, section.y0, section.x1, section.y1)
     assert region.size[0] == pytest.approx(scale.bridge_length)
     beam = region.heights[0] == 0
@@ -275,11 +274,11 @@ def test_bridge_by_measurement(robot: str, seed: int) -> None:
     assert y == pytest.approx(region.centres[1][beam].mean())
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 @pytest.mark.parametrize("difficulty", [0.2, 1.0])
 def test_valley_walls_have_the_angle_and_height(robot: str, difficulty: float) -> None:
     terrain = make_terrain("valley", robot=robot, difficulty=difficulty, seed=1)
-    (section,), scale = terrain.sections, SCALES[robot]
+    (section,), scale = terrain.sections, ROBOTS[robot].scale
     profile = terrain.elevation.heights[round((section.x0 + 1) / scale.resolution)]
     bottom = round(terrain.lane[1][1] / scale.resolution)
     angle = scale.valley_angle[0] + difficulty * np.subtract(*scale.valley_angle[::-1])
@@ -292,19 +291,20 @@ def test_valley_walls_have_the_angle_and_height(robot: str, difficulty: float) -
     assert profile[0] >= 0.5 and profile[-1] >= 0.5
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", tuple(ROBOTS))
 def test_ramps_are_never_steeper_than_the_scale_says(robot: str) -> None:
-    limit = math.tan(math.radians(SCALES[robot].slope_angle[1])) * SCALES[robot].resolution
+    scale = ROBOTS[robot].scale
+    limit = math.tan(math.radians(scale.slope_angle[1])) * scale.resolution
     for seed in range(8):
         boxes = make_terrain("slopes", robot=robot, seed=seed).boxes
-        steepest = max(abs(math.tan(box.rpy[1])) for box in boxes) * SCALES[robot].resolution
+        steepest = max(abs(math.tan(box.rpy[1])) for box in boxes) * scale.resolution
         assert 0.3 * limit < steepest <= limit + 1e-6
 
 
 def test_resolution_and_scale_can_be_given() -> None:
     fine = make_terrain("steps", resolution=0.05, seed=1)
     assert fine.elevation.resolution == 0.05
-    wide = make_terrain("gaps", scale=replace(SCALES["toy"], gap_width=(0.1, 0.6)), seed=1)
+    wide = make_terrain("gaps", scale=replace(ROBOTS["toy"].scale, gap_width=(0.1, 0.6)), seed=1)
     row = wide.elevation.heights[:, 0]
     assert np.diff(np.flatnonzero(np.diff(row)))[0] == 6
 
@@ -323,12 +323,12 @@ def test_resolution_and_scale_can_be_given() -> None:
         ({"resolution": 1e-4}, "resolution: should be greater than or equal to 0.005"),
         ({"resolution": math.nan}, "resolution: should be a finite number"),
         (
-            {"resolution": 0.005, "scale": replace(SCALES["toy"], length=50.0, width=50.0)},
-            "100000000 cells, more than 20000000",
+            {"resolution": 0.005, "scale": replace(ROBOTS["toy"].scale, length=50.0, width=50.0)},
+            "10000 x 10000 cells are more than 50000000",
         ),
-        ({"scale": replace(SCALES["toy"], length=3.0)}, "no room"),
+        ({"scale": replace(ROBOTS["toy"].scale, length=3.0)}, "no room"),
         ({"neighbours": True, "name": "stairs"}, "no neighbours for 'stairs'"),
-        ({"neighbours": True, "scale": replace(SCALES["toy"], length=4.5)}, "4 landings"),
+        ({"neighbours": True, "scale": replace(ROBOTS["toy"].scale, length=4.5)}, "4 landings"),
     ],
 )
 def test_out_of_range(arguments: dict, message: str) -> None:
@@ -421,7 +421,7 @@ def test_worlds_that_do_not_fit(tiles: list[list[str]], message: str) -> None:
 
 @given(
     name=st.sampled_from(TERRAINS),
-    robot=st.sampled_from(ROBOTS),
+    robot=st.sampled_from(tuple(ROBOTS)),
     difficulty=st.floats(0, 1),
     seed=st.integers(0, 2**31),
     resolution=st.sampled_from((None, 0.03, 0.07, 0.1, 0.15, 0.2)),

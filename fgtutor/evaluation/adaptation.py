@@ -19,6 +19,7 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
+from fgtutor.pipeline import plan_on_map
 from jaxtyping import Float
 from torch import Tensor
 
@@ -33,13 +34,13 @@ from fgtutor.execution import execute_batch
 from fgtutor.figures.maps_svg import draw_maps
 from fgtutor.io.validation import Count, check_arguments
 from fgtutor.io.validation import Share as Fraction
-from fgtutor.pipeline import plan_on_map
 from fgtutor.planning import plan
+from fgtutor.robots import ROBOTS
 from fgtutor.routes import Route
 from fgtutor.specialist import ZOO, Specialist
 from fgtutor.statistics import Share, spl
 from fgtutor.tensorization import tensorize
-from fgtutor.world.obstacles import SCALES, Course
+from fgtutor.world.obstacles import Course
 from fgtutor.world.terrain import Section, Terrain, TerrainSeed, rasterise
 
 COMMAND = "evaluate adaptation"
@@ -105,10 +106,10 @@ def make_map(robot: str, seed: TerrainSeed, heights: Risers = AdaptationConfig.h
     Raises `TerrainError` for an unknown robot.
     """
     check_arguments(make_map, locals(), TerrainError)
-    if robot not in SCALES:
-        raise TerrainError(f"unknown robot {robot!r}: choose one of {', '.join(SCALES)}")
+    if robot not in ROBOTS:
+        raise TerrainError(f"unknown robot {robot!r}: choose one of {', '.join(ROBOTS)}")
     width = BELOW + GATES[-1] + GATE_WIDTH
-    scale = replace(SCALES[robot], width=width, length=STRAIGHT + 2 * SIDE)
+    scale = replace(ROBOTS[robot].scale, width=width, length=STRAIGHT + 2 * SIDE)
     course = Course(scale, 1.0, np.random.default_rng((seed, 2)))
     thickness = course.snap(TREADS * fmean(scale.step_tread))
     x0 = course.snap((scale.length - thickness) / 2)

@@ -16,9 +16,9 @@ from fgtutor.evaluation.report import markdown
 from fgtutor.evaluation.success import TrialsConfig, by_cell
 from fgtutor.evaluation.tasks import Row
 from fgtutor.io.validation import Unique
+from fgtutor.robots import ROBOTS
 from fgtutor.specialist import GENERAL, Specialist
 from fgtutor.statistics import Share
-from fgtutor.world.terrain import SCALES
 
 COMMAND = "evaluate matrix"
 
@@ -44,7 +44,7 @@ def policies(config: MatrixConfig, zoo: Mapping[str, Specialist]) -> tuple[str, 
 
 def terrains(config: MatrixConfig) -> tuple[str, ...]:
     """Return the terrains to evaluate on."""
-    return config.terrains or (*SCALES[config.robot].mixed, "mixed")
+    return config.terrains or (*ROBOTS[config.robot].scale.mixed, "mixed")
 
 
 def evaluate(config: MatrixConfig) -> list[Row]:

@@ -22,9 +22,9 @@ from fgtutor.evaluation.success import TrialsConfig, by_cell, make_ground, summa
 from fgtutor.evaluation.tasks import Row
 from fgtutor.evaluation.trials import drive
 from fgtutor.io.validation import Unique
+from fgtutor.robots import ROBOTS
 from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist, load_zoo
 from fgtutor.statistics import Share
-from fgtutor.world.terrain import SCALES
 
 COMMAND = "evaluate newcomer"
 STAGES = ("without", "with")
@@ -89,7 +89,7 @@ def terrains(config: NewcomerConfig) -> tuple[str, ...]:
     provenance = load_specialist(config.folder).provenance
     its_own = config.terrain or provenance.get("terrain", config.name)
     return tuple(
-        dict.fromkeys((its_own, *(config.others or (*SCALES[config.robot].mixed, "mixed"))))
+        dict.fromkeys((its_own, *(config.others or (*ROBOTS[config.robot].scale.mixed, "mixed"))))
     )
 
 

@@ -41,11 +41,10 @@ from fgtutor.io.validation import Seed, Unique, parse_options
 from fgtutor.learning import training
 from fgtutor.learning.config import A1TrainConfig, TrainConfig, comparable, training_world
 from fgtutor.learning.trainer import CHECKPOINT, Trainer, give_back_memory
-from fgtutor.robots import env_class
+from fgtutor.robots import ROBOTS, env_class
 from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist
 from fgtutor.statistics import Share
 from fgtutor.statistics import calibration as compare
-from fgtutor.world.terrain import SCALES
 
 COMMAND, RUNS = "sweep", "runs"
 """Its name, and where in the report folder the run folders lie."""
@@ -149,7 +148,7 @@ def trainings(config: SweepConfig) -> list[Training]:
     Raises `ConfigError` if a value does not fit, or two trainings would be the same.
     """
     env_class(config.robot)  # an unknown robot fails here
-    terrains, start = config.terrains or SCALES[config.robot].mixed, config.train.start_from
+    terrains, start = config.terrains or ROBOTS[config.robot].scale.mixed, config.train.start_from
     shared = replace(config.train, robot=config.robot, start_from=start and start.resolve())
     for terrain in terrains:  # as does an unknown terrain
         training_world(replace(shared, terrain=terrain, rows=1, columns=1))
@@ -198,7 +197,7 @@ def run_task(work: Training, trials: int) -> list[Row]:
 def _crossings(work: Training, specialist: Specialist, trials: int) -> list[Row]:
     """Return a row a crossing of held-out terrain, as `fgtutor evaluate matrix` would drive it."""
     config = work.config
-    kinds = SCALES[config.robot].mixed if config.terrain == GENERAL else (config.terrain,)
+    kinds = ROBOTS[config.robot].scale.mixed if config.terrain == GENERAL else (config.terrain,)
     known = {
         "training": work.name,
         "trained_on": config.terrain,

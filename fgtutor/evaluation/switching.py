@@ -33,11 +33,12 @@ from fgtutor.execution import FollowConfig, execute_batch
 from fgtutor.figures.rates_svg import share_chart
 from fgtutor.io.validation import Count, Positive, Unique, check_arguments
 from fgtutor.io.validation import Share as Fraction
+from fgtutor.robots import ROBOTS
 from fgtutor.robots.lidar import scan_terrain, survey
 from fgtutor.routes import Route
 from fgtutor.specialist import GENERAL, Specialist
 from fgtutor.statistics import Share
-from fgtutor.world.obstacles import OBSTACLES, SCALES, Course
+from fgtutor.world.obstacles import OBSTACLES, Course
 from fgtutor.world.scanning import ScanConfig, map_points
 from fgtutor.world.terrain import Section, Terrain, TerrainSeed, rasterise
 
@@ -48,11 +49,6 @@ Levels = Annotated[tuple[tuple[Error, Error], ...], MinLen(1), Unique]
 """Pairs of both."""
 
 COMMAND = "evaluate switching"
-ORDERS = {
-    "a1": ("steps", "valley", "steps", "gaps", "bridge", "steps"),
-    "toy": ("steps", "slopes", "steps", "gaps", "rubble", "steps"),
-}
-"""What follows what on the whole course: the paper's order, and the toy's own terrains in it."""
 FULL = "full"
 """Name of the whole course."""
 NEARLY_FREE = 1e-6
@@ -118,9 +114,9 @@ def variants(config: SwitchingConfig, zoo: Mapping[str, Specialist]) -> dict[str
 
 def courses(config: SwitchingConfig) -> dict[str, tuple[str, ...]]:
     """Return the terrains of each course, in the paper's order; raises `ConfigError` for others."""
-    order = ORDERS.get(config.robot)
-    if order is None:
-        raise ConfigError(f"no course for robot {config.robot!r}: choose of {', '.join(ORDERS)}")
+    if config.robot not in ROBOTS:
+        raise ConfigError(f"no course for robot {config.robot!r}: choose of {', '.join(ROBOTS)}")
+    order = ROBOTS[config.robot].course
     known = {"-".join(pair): pair for pair in pairwise(order)} | {FULL: order}
     return _choose("course", config.courses, known)
 
@@ -141,12 +137,12 @@ def lay_course(
     Raises `TerrainError` for an unknown kind or robot, or for none.
     """
     check_arguments(lay_course, locals(), TerrainError)
-    if robot not in SCALES or not kinds or not set(kinds) <= OBSTACLES.keys():
+    if robot not in ROBOTS or not kinds or not set(kinds) <= OBSTACLES.keys():
         raise TerrainError(
             f"cannot lay {', '.join(kinds) or 'nothing'} for {robot!r}: choose of "
-            f"{', '.join(OBSTACLES)}, and a robot of {', '.join(SCALES)}"
+            f"{', '.join(OBSTACLES)}, and a robot of {', '.join(ROBOTS)}"
         )
-    scale = SCALES[robot]
+    scale = ROBOTS[robot].scale
     course = Course(scale, difficulty, np.random.default_rng((seed, 3)))
     x, sections, lane = 0.0, [], []
     for kind in kinds:

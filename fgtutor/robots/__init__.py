@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from fgtutor.errors import ConfigError
-from fgtutor.world.obstacles import SCALES, TerrainScale
+from fgtutor.world.obstacles import TerrainScale
 
 if TYPE_CHECKING:
     from fgtutor.robots.base import LocomotionEnv
@@ -39,12 +39,33 @@ class Robot:
 ROBOTS = {
     "toy": Robot(
         env="fgtutor.robots.toy:ToyEnv",
-        scale=SCALES["toy"],
+        scale=TerrainScale(
+            resolution=0.1,
+            length=9.0,
+            chasm_depth=(0.05, 0.5, 1.0),
+            step_height=(0.06, 0.15),
+            # A toy drives in a slice: what differs beside it would only blur what its terrains are.
+            block_share=0.0,
+            lane_share=0.0,
+            bank_share=0.0,
+            step_tread=(0.75, 1.1),
+            gap_width=(0.1, 0.4),
+            bridge_width=(1.6, 0.6),
+            slope_angle=(8.0, 40.0),
+            slope_height=0.7,
+            stair_rise=0.16,
+            stair_run=0.4,
+            rubble_height=0.1,
+            rubble_size=(0.1, 0.2),
+            rubble_density=0.3,
+            mixed=("steps", "gaps", "slopes", "rubble"),
+        ),
         order=("steps", "slopes", "steps", "gaps", "rubble", "steps"),
     ),
     "a1": Robot(
         env="fgtutor.robots.a1.env:A1Env",
-        scale=SCALES["a1"],
+        # The paper's steps of 5-15 cm, gaps of 15 cm, beam of 35 cm, walls of 50 degrees.
+        scale=TerrainScale(),
         order=("steps", "valley", "steps", "gaps", "bridge", "steps"),  # the paper's
     ),
 }

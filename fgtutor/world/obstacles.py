@@ -99,33 +99,6 @@ class TerrainScale:
         return {"bridge": self.bridge_length, "valley": self.valley_length}.get(kind, self.length)
 
 
-SCALES = {
-    "a1": TerrainScale(),  # the paper's steps of 5-15 cm, gaps of 15 cm, beam of 35 cm, 50 degrees
-    "toy": TerrainScale(
-        resolution=0.1,
-        length=9.0,
-        chasm_depth=(0.05, 0.5, 1.0),
-        step_height=(0.06, 0.15),
-        # A toy drives in a slice: what differs beside it would only blur what its terrains are.
-        block_share=0.0,
-        lane_share=0.0,
-        bank_share=0.0,
-        step_tread=(0.75, 1.1),
-        gap_width=(0.1, 0.4),
-        bridge_width=(1.6, 0.6),
-        slope_angle=(8.0, 40.0),
-        slope_height=0.7,
-        stair_rise=0.16,
-        stair_run=0.4,
-        rubble_height=0.1,
-        rubble_size=(0.1, 0.2),
-        rubble_density=0.3,
-        mixed=("steps", "gaps", "slopes", "rubble"),
-    ),
-}
-"""The presets, by robot."""
-
-
 class Course:
     """A corridor under construction: collects boxes, and knows the scale, difficulty and rng."""
 

@@ -17,11 +17,11 @@ from jaxtyping import Float
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import TerrainError
 from fgtutor.io.validation import Share, check_arguments, check_fields
+from fgtutor.robots import ROBOTS
 from fgtutor.world.boxes import Box, boxes_from_elevation, columns, rasterise
-from fgtutor.world.obstacles import OBSTACLES, SCALES, SPREAD, Course, Resolution, TerrainScale
+from fgtutor.world.obstacles import OBSTACLES, SPREAD, Course, Resolution, TerrainScale
 
 __all__ = [
-    "SCALES",
     "TERRAINS",
     "Box",
     "Section",
@@ -140,7 +140,7 @@ def make_terrain(
 
     Args:
         name: One of `TERRAINS`.
-        robot: Whose scale to use, one of `SCALES`.
+        robot: Whose scale to use, one of `robots.ROBOTS`.
         difficulty: From 0 (almost flat) to 1 (the full size in the scale).
         seed: Any integer from 0 that has 63 bits.
         resolution: Side of a cell, m; default: the scale's.
@@ -155,9 +155,9 @@ def make_terrain(
     check_arguments(make_terrain, locals(), TerrainError)
     if name not in TERRAINS:
         raise TerrainError(f"unknown terrain {name!r}: choose one of {', '.join(TERRAINS)}")
-    if robot not in SCALES:
-        raise TerrainError(f"unknown robot {robot!r}: choose one of {', '.join(SCALES)}")
-    scale = scale or SCALES[robot]
+    if robot not in ROBOTS:
+        raise TerrainError(f"unknown robot {robot!r}: choose one of {', '.join(ROBOTS)}")
+    scale = scale or ROBOTS[robot].scale
     if resolution is not None:
         scale = replace(scale, resolution=resolution)
     rng = np.random.default_rng((seed, TERRAINS.index(name)))

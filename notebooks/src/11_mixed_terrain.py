@@ -23,11 +23,11 @@ from dataclasses import replace
 
 from fgtutor import load_zoo, make_terrain
 from fgtutor.figures.maps import draw_elevation
-from fgtutor.world.terrain import SCALES
+from fgtutor.robots import ROBOTS
 
 everyone = load_zoo("a1", include_general=True)
 zoo = {name: s for name, s in everyone.items() if name != "general"}
-narrow = replace(SCALES["a1"], width=2.4)
+narrow = replace(ROBOTS["a1"].scale, width=2.4)
 
 
 def corridor(kind, seed):
