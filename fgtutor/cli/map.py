@@ -29,15 +29,11 @@ class MapConfig(ScanConfig):
     """Map only x0 y0 x1 y1, m; default: all points."""
     fill: bool = False
     """Give unknown cells the nearest known height; they stay marked as unknown."""
-    statistics: Path | None = None
-    """Write the points' count, lowest, p95 and variance in each cell here (.npz)."""
 
 
 def run(config: MapConfig) -> int:
     """Map a cloud from the command line."""
-    for path in (config.out, config.statistics):
-        if path is not None:
-            check_writable(path)
+    check_writable(config.out)
     cloud = read_cloud(config.cloud)
     print(f"{config.cloud}: {len(cloud.points)} points")
     scanned = map_points(cloud, config=config, area=config.area)
@@ -46,9 +42,6 @@ def run(config: MapConfig) -> int:
     unknown = 1 - elevation.known.mean()
     median = np.median(scanned.count[elevation.known])
     print(f"{unknown:.1%} of the cells are unknown; the others hold {median:g} points (median)")
-    if config.statistics:
-        scanned.save_statistics(config.statistics)
-        print(f"statistics -> {config.statistics}")
     (elevation.filled() if config.fill else elevation).save(config.out)
     print(f"map -> {config.out}")
     left_out = (

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import TerrainError
-
-MOST_CELLS = 20_000_000
-"""Cells of the largest map that boxes are rasterised to."""
+from fgtutor.grid import check_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,25 +30,12 @@ class Box:
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """The matrix Rz(yaw) Ry(pitch) Rx(roll); its columns are the box's axes in the world."""
-        (cr, cp, cy), (sr, sp, sy) = np.cos(self.rpy), np.sin(self.rpy)
-        return np.array(
-            [
-                [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-                [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-                [-sp, cp * sr, cp * cr],
-            ]
-        )
+        return Rotation.from_euler("xyz", self.rpy).as_matrix()
 
     @property
-    def quaternion(self) -> tuple[float, float, float, float]:
-        """The same rotation as (w, x, y, z), the order MuJoCo uses."""
-        (cr, cp, cy), (sr, sp, sy) = np.cos(np.divide(self.rpy, 2)), np.sin(np.divide(self.rpy, 2))
-        return (
-            float(cr * cp * cy + sr * sp * sy),
-            float(sr * cp * cy - cr * sp * sy),
-            float(cr * sp * cy + sr * cp * sy),
-            float(cr * cp * sy - sr * sp * cy),
-        )
+    def quaternion(self) -> list[float]:
+        """The same rotation as [w, x, y, z], the order MuJoCo uses."""
+        return Rotation.from_euler("xyz", self.rpy).as_quat(scalar_first=True).tolist()
 
     def shifted(self, dx: float, dy: float) -> "Box":
         """Return the box moved in the plane."""
@@ -62,14 +48,10 @@ def rasterise(boxes: Sequence[Box], size: tuple[float, float], resolution: float
 
     The vertical line through a centre meets a box where it is inside all three pairs of faces (the
     slab test for rays); the upper end of that interval is the height. Cells without a box are NaN.
-    Raises `TerrainError` if the map would have more than `MOST_CELLS` cells.
+    Raises `TerrainError` if the map would have too many cells.
     """
     nx, ny = (round(length / resolution) for length in size)
-    if nx * ny > MOST_CELLS:
-        raise TerrainError(
-            f"a terrain of {size[0]:g} x {size[1]:g} m with cells of {resolution:g} m has "
-            f"{nx * ny} cells, more than {MOST_CELLS}: choose larger cells or a smaller terrain"
-        )
+    check_cells((nx, ny), TerrainError)
     heights = np.full((nx, ny), -np.inf)
     for box in boxes:
         # Only the cells under the box's bounding rectangle, one more to each side.
@@ -97,18 +79,18 @@ def _top(box: Box, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.where(low <= high, box.centre[2] + high, -np.inf)
 
 
-def boxes_from_elevation(elevation: ElevationMap) -> tuple[Box, ...]:
+def boxes_from_elevation(
+    elevation: ElevationMap, wanted: Bool[np.ndarray, "nx ny"] | None = None
+) -> tuple[Box, ...]:
     """Return upright boxes for a map, one for each rectangle of cells of equal height.
 
     Made for piecewise-flat maps: on a slope every cell becomes a box. Unknown cells are filled.
+    Rectangles are found greedily: along y while heights agree, then along x. With `wanted`, only
+    these cells are covered.
     """
     ground = elevation.filled()
-    return columns(ground, np.ones(ground.shape, dtype=bool))
-
-
-def columns(ground: ElevationMap, wanted: Bool[np.ndarray, "nx ny"]) -> tuple[Box, ...]:
-    """Cover the wanted cells with upright boxes, greedily: along y while heights agree, then x."""
-    heights, todo, step = ground.heights, wanted.copy(), ground.resolution
+    heights, step = ground.heights, ground.resolution
+    todo = np.ones(ground.shape, dtype=bool) if wanted is None else wanted.copy()
     bottom = float(heights.min()) - 0.5
     boxes = []
     while todo.any():

@@ -18,7 +18,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import TerrainError
 from fgtutor.io.validation import Share, check_arguments, check_fields
 from fgtutor.robots import ROBOTS
-from fgtutor.world.boxes import Box, boxes_from_elevation, columns, rasterise
+from fgtutor.world.boxes import Box, boxes_from_elevation, rasterise
 from fgtutor.world.obstacles import OBSTACLES, SPREAD, Course, Resolution, TerrainScale
 
 __all__ = [
@@ -319,5 +319,7 @@ class World:
             margin = np.ones(padded.shape, dtype=bool)
             margin[n : n + ground.shape[0], n : n + ground.shape[1]] = False
             inside = tile.boxes or boxes_from_elevation(ground)
-            boxes += [box.shifted(dx, dy) for box in (*inside, *columns(padded, margin))]
+            boxes += [
+                box.shifted(dx, dy) for box in (*inside, *boxes_from_elevation(padded, margin))
+            ]
         return tuple(boxes)
