@@ -313,7 +313,7 @@ def test_resolution_and_scale_can_be_given() -> None:
     ("arguments", "message"),
     [
         ({"name": "lava"}, "flat, gentle, steps"),
-        ({"robot": "spot"}, "a1, toy"),
+        ({"robot": "spot"}, "toy, a1"),
         ({"difficulty": 1.1}, "difficulty: should be less than or equal to 1, got 1.1"),
         ({"difficulty": -0.1}, "difficulty: should be greater than or equal to 0"),
         ({"difficulty": math.nan}, "difficulty: should be a finite number"),
