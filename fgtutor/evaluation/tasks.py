@@ -2,11 +2,12 @@
 
 Reads tasks, each a function of a module and plain arguments; gives every task's rows as soon as it
 has finished. A task's rows depend on its arguments only, so the order, the place and the number of
-workers change nothing. A worker that vanishes (killed, out of memory) costs its task one more try.
+workers change nothing. A worker that dies (killed, out of memory) costs its own task another try.
 """
 
 import os
 import pickle
+import platform
 import signal
 import sys
 import threading
@@ -14,22 +15,30 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
-from multiprocessing import connection, get_context, parent_process
+from importlib.metadata import version
+from multiprocessing import get_context, parent_process
+from pathlib import Path
 from typing import Any
 
+from pebble import ProcessExpired, ProcessPool
 from tqdm import tqdm
 
+from fgtutor import __version__
 from fgtutor.errors import ConfigError, EvaluationError, FgtutorError, MissingExtraError
-from fgtutor.evaluation.provenance import machine
 from fgtutor.io.machine import usable_cores
 
 Row = dict[str, Any]
 """One trial, as JSON keeps it."""
 ATTEMPTS = 3
 """A task that has taken down this many workers is not tried again."""
+PACKAGES = ("torch", "numpy", "scipy", "rsl-rl-lib", "pymunk", "mujoco")
+"""Whose versions may change a result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,24 +59,18 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What became of a task."""
+    """What a task gave."""
 
     rows: list[Row]
-    """One a trial."""
+    """One per trial."""
     seconds: float
     """How long it took, s."""
     machine: dict[str, Any] = field(default_factory=dict)
     """Where it ran, with which versions."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Failure:
-    """An exception on its way from a worker."""
-
-    error: FgtutorError | None
-    """Set if fgtutor raised it on purpose."""
-    trace: str
-    """How it came about."""
+Submit = Callable[[Task], Future[Result | FgtutorError]]
+"""Hands a task to a worker; its future raises only if that worker dies."""
 
 
 def run_tasks(
@@ -85,28 +88,41 @@ def run_tasks(
         ConfigError: No Ray cluster answers at that address, or none of its machines has the cores
             or GPUs that a task takes.
     """
+    at_once = len(tasks) if ray is not None else min(workers or usable_cores(), len(tasks))
     if ray is not None:
-        yield from _on_ray(tasks, ray)
-        return
-    workers = min(workers or usable_cores(), len(tasks))
-    if workers > 1:
-        yield from _on_processes(tasks, workers)
-        return
-    for task in tasks:
-        yield task, _unwrap(task, _work(pickle.dumps(task)))
+        place = _ray_cluster(ray, tasks)
+    elif at_once > 1:
+        place = _processes(at_once)
+    else:
+        place = nullcontext(_do_here)
+    with place as submit:
+        yield from _finished(tasks, submit, at_once)
 
 
-def _work(pickled: bytes) -> Result | _Failure:
-    """Do one task; what it raises is returned, so that it reaches the caller."""
+def _do_here(task: Task) -> Future[Result | FgtutorError]:
+    done = Future()
+    done.set_result(_work(task.name, pickle.dumps(task)))
+    return done
+
+
+def _work(name: str, pickled: bytes) -> Result | FgtutorError:
+    """Do the task `name`; what it raises is returned, so that every kind of worker gives it alike.
+
+    It comes pickled, so that a worker accepts it before importing what it needs.
+    """
     try:
         task: Task = pickle.loads(pickled)
         began = time.perf_counter()
         with _one_thread():
             rows = task.function(*task.arguments)
         return Result(rows=rows, seconds=time.perf_counter() - began, machine=machine())
-    except Exception as error:
-        expected = error if isinstance(error, FgtutorError) else None
-        return _Failure(error=expected, trace=traceback.format_exc())
+    except FgtutorError as error:
+        return error
+    except Exception:
+        return EvaluationError(
+            f"task {name} failed; the finished ones are kept, correct this and run again:\n"
+            f"{traceback.format_exc()}"
+        )
 
 
 @contextmanager
@@ -124,52 +140,63 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _unwrap(task: Task, outcome: Result | _Failure) -> Result:
-    if isinstance(outcome, Result):
-        return outcome
-    if outcome.error is not None:
-        raise outcome.error
-    raise EvaluationError(
-        f"task {task.name} failed; the finished ones are kept, correct this and run again:\n"
-        f"{outcome.trace}"
-    )
+def _finished(tasks: Sequence[Task], submit: Submit, at_once: int) -> Iterator[tuple[Task, Result]]:
+    """Submit tasks, `at_once` at a time, and yield each with its result when it is done."""
+    waiting, deaths = deque(tasks), Counter[str]()
+    running: dict[Future[Result | FgtutorError], Task] = {}
+    while waiting or running:
+        while waiting and len(running) < at_once:
+            task = waiting.popleft()
+            running[submit(task)] = task
+        done, _ = wait(running, return_when=FIRST_COMPLETED)
+        for future in done:
+            task = running.pop(future)
+            if death := future.exception():
+                deaths[task.name] += 1
+                if deaths[task.name] == ATTEMPTS or isinstance(death, BrokenProcessPool):
+                    raise _lost(task, deaths[task.name], death)
+                waiting.appendleft(task)
+                continue
+            outcome = future.result()
+            if isinstance(outcome, FgtutorError):
+                raise outcome
+            yield task, outcome
 
 
-def _lost(task: Task, how: str) -> EvaluationError:
+def _lost(task: Task, attempt: int, death: BaseException) -> EvaluationError:
+    how = f"exit code {death.exitcode}" if isinstance(death, ProcessExpired) else str(death)
     return EvaluationError(
-        f"task {task.name} took its worker down {ATTEMPTS} times ({how}): look for what kills "
-        "it (exit code -9 often means that memory ran out: take fewer workers); the finished "
-        "tasks are kept, run again to go on"
+        f"task {task.name} lost its worker on attempt {attempt} of {ATTEMPTS} ({how}): look for "
+        "what ends it (exit code -9 often means that memory ran out: take fewer workers); the "
+        "finished tasks are kept, run again to go on"
     )
 
 
-class _Worker:
-    """A process that does one task after another, and the line to it."""
+@contextmanager
+def _processes(workers: int) -> Iterator[Submit]:
+    """Offer processes of this machine, which end with the block, even in the middle of a task."""
+    # Spawned, not forked: torch's threads do not survive a fork.
+    pool = ProcessPool(workers, initializer=_prepare_worker, context=get_context("spawn"))
+    with _safe_path():
+        try:
+            yield lambda task: pool.schedule(_work, (task.name, pickle.dumps(task)))
+        finally:
+            pool.stop()
+            pool.join()
 
-    def __init__(self) -> None:
-        # Spawned, not forked: torch's threads do not survive a fork.
-        context = get_context("spawn")
-        self.line, theirs = context.Pipe()
-        # A daemon is stopped when this process ends; if it is killed, the worker sees to that.
-        self.process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        with _safe_path():
-            self.process.start()
-        theirs.close()  # or the end of the worker would not be the end of the line
-        self.task: Task | None = None
 
-    def give(self, task: Task) -> None:
-        """Hand over a task; if the worker has died meanwhile, reading its answer will tell."""
-        self.task = task
-        with suppress(OSError):
-            self.line.send_bytes(pickle.dumps(task))
+def _prepare_worker() -> None:
+    """Let this process end at once if it is told to, or if the one that asked has ended."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    # The default is a lock between processes, which a process that is stopped leaves behind.
+    tqdm.set_lock(threading.RLock())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
-    def stop(self) -> None:
-        """End the process: with a farewell if it waits, without one if it is at work."""
-        self.line.close()
-        if self.task is None:
-            self.process.join(timeout=5.0)
-        self.process.terminate()
-        self.process.join()
+
+def _end_with_parent() -> None:
+    if parent := parent_process():
+        parent.join()
+        os._exit(1)
 
 
 @contextmanager
@@ -188,57 +215,9 @@ def _safe_path() -> Iterator[None]:
             os.environ["PYTHONSAFEPATH"] = before
 
 
-def _serve(line: connection.Connection) -> None:
-    """Do the tasks that come down the line, until it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asked
-    # Its default is one between processes, which a process that is stopped leaves behind.
-    tqdm.set_lock(threading.RLock())
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    with suppress(EOFError, OSError):
-        while True:
-            line.send(_work(line.recv_bytes()))
-
-
-def _end_with_parent() -> None:
-    """End this process as soon as the one that asked has, even in the middle of a task."""
-    if parent := parent_process():
-        parent.join()
-        os._exit(1)
-
-
-def _on_processes(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, Result]]:
-    waiting, deaths = deque(tasks), Counter[str]()
-    team = [_Worker() for _ in range(workers)]
-    try:
-        while waiting or any(worker.task for worker in team):
-            for worker in team:
-                if worker.task is None and waiting:
-                    worker.give(waiting.popleft())
-            busy = [(worker, worker.task) for worker in team if worker.task]
-            ready = connection.wait([worker.line for worker, _ in busy])
-            for worker, task in busy:
-                if worker.line not in ready:
-                    continue
-                worker.task = None
-                try:
-                    outcome = worker.line.recv()
-                except (EOFError, OSError):
-                    worker.stop()
-                    deaths[task.name] += 1
-                    if deaths[task.name] == ATTEMPTS:
-                        how = f"the last time with exit code {worker.process.exitcode}"
-                        raise _lost(task, how) from None
-                    team[team.index(worker)] = _Worker()
-                    waiting.appendleft(task)
-                    continue
-                yield task, _unwrap(task, outcome)
-    finally:
-        # Whoever is at work first: the others take their leave, and meanwhile it would go on.
-        for worker in sorted(team, key=lambda worker: worker.task is None):
-            worker.stop()
-
-
-def _on_ray(tasks: Sequence[Task], address: str) -> Iterator[tuple[Task, Result]]:
+@contextmanager
+def _ray_cluster(address: str, tasks: Sequence[Task]) -> Iterator[Submit]:
+    """Offer the workers of a Ray cluster, which must be able to do the tasks."""
     try:
         ray = import_module("ray")
     except ImportError as error:
@@ -256,20 +235,14 @@ def _on_ray(tasks: Sequence[Task], address: str) -> Iterator[tuple[Task, Result]
         ) from error
     try:
         _check_cluster([node["Resources"] for node in ray.nodes() if node["Alive"]], tasks)
-        # Ray itself does a task again whose worker vanished.
-        remote = ray.remote(max_retries=ATTEMPTS - 1)(_work)
-        running = {
-            remote.options(num_cpus=task.cores, num_gpus=task.gpus).remote(pickle.dumps(task)): task
-            for task in tasks
-        }
-        while running:
-            (done,), _ = ray.wait(list(running), num_returns=1)
-            task = running.pop(done)
-            try:
-                outcome = ray.get(done)
-            except ray.exceptions.RayError as error:
-                raise _lost(task, str(error)) from error
-            yield task, _unwrap(task, outcome)
+        remote = ray.remote(max_retries=0)(_work)  # `_finished` tries again
+        yield (
+            lambda task: (
+                remote.options(num_cpus=task.cores, num_gpus=task.gpus)
+                .remote(task.name, pickle.dumps(task))
+                .future()
+            )
+        )
     finally:
         ray.shutdown()
 
@@ -288,3 +261,31 @@ def _check_cluster(machines: Sequence[dict[str, float]], tasks: Sequence[Task]) 
                 f"of the cluster's {len(machines)} machines has: ask for fewer, or let a larger "
                 "machine join"
             )
+
+
+@cache
+def machine() -> dict[str, Any]:
+    """Return this machine's processor, cores and system, and the versions of what computes here.
+
+    Not its name: a report may be published.
+    """
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "versions": {
+            "fgtutor": __version__,
+            "python": platform.python_version(),
+            **{package: version(package) for package in PACKAGES},
+        },
+    }
+
+
+def _processor() -> str:
+    """Return the processor's name; Linux tells it only in a file."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())

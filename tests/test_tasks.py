@@ -37,7 +37,7 @@ def killed(folder):
     os.kill(os.getpid(), signal.SIGKILL)
 
 def left_alone(folder):
-    # Whoever asked for this is killed; nobody waits for it any more.
+    # Its result is no longer wanted before it is there.
     Path(folder, "worker").write_text(str(os.getpid()))
     time.sleep(600)
 
@@ -103,15 +103,16 @@ def test_a_killed_worker_loses_nothing(work, tmp_path):
     assert sorted(done) == ["t0", "t1", "t2", "victim"]
 
 
+@pytest.mark.slow
 def test_a_task_that_always_kills_its_worker_is_named(work, tmp_path):
     tasks = [*squares(work, 1), Task(name="bad", function=work.killed, arguments=(str(tmp_path),))]
-    with pytest.raises(EvaluationError, match=r"task bad .* exit code -9"):
+    with pytest.raises(EvaluationError, match=r"task bad .*attempt 3 of 3 \(exit code -9\)"):
         list(run_tasks(tasks, workers=2))
     assert Path(tmp_path, "deaths").read_text() == "x" * ATTEMPTS
 
 
 @pytest.mark.slow
-def test_workers_end_with_whoever_is_killed(work, tmp_path):
+def test_workers_end_when_the_process_that_started_them_is_killed(work, tmp_path):
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import fgtutor_work as work\n"
         "from fgtutor.evaluation.tasks import Task, run_tasks\n"
@@ -128,6 +129,32 @@ def test_workers_end_with_whoever_is_killed(work, tmp_path):
     asks.kill()
     asks.wait()
     assert eventually(lambda: not alive(worker))
+
+
+@pytest.mark.slow
+def test_workers_end_at_once_when_the_caller_stops(work, tmp_path):
+    tasks = [
+        Task(name="a", function=work.left_alone, arguments=(str(tmp_path),)),
+        *squares(work, 1),
+    ]
+    running = run_tasks(tasks, workers=2)
+    next(running)
+    assert eventually(lambda: (tmp_path / "worker").exists() and (tmp_path / "worker").read_text())
+    running.close()  # as Ctrl-C does
+    assert not alive(int((tmp_path / "worker").read_text()))
+
+
+@pytest.mark.slow
+def test_workers_that_cannot_start_are_an_error(work, tmp_path):
+    script = tmp_path / "unguarded.py"
+    script.write_text(
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import fgtutor_work as work\n"
+        "from fgtutor.evaluation.tasks import Task, run_tasks\n"
+        "tasks = [Task(name=f't{i}', function=work.square, arguments=(i,)) for i in range(3)]\n"
+        "list(run_tasks(tasks, workers=2))"  # every worker imports this and would start its own
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "EvaluationError: task t" in done.stderr
 
 
 def eventually(condition, seconds=60):
