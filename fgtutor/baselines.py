@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -22,14 +22,14 @@ from torch import Tensor
 
 from fgtutor.directions import NUM_HEADINGS
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError, PlanningError
+from fgtutor.errors import ConfigError
 from fgtutor.fusion import fuse
 from fgtutor.io.validation import Count, Positive, check_fields
-from fgtutor.pipeline import plan_on_map
-from fgtutor.planning import Cost
-from fgtutor.routes import Route
+from fgtutor.planning import Point, plan_on_map
+from fgtutor.routes import Refusal, Route
+from fgtutor.settings import PlanSettings, Taus
 from fgtutor.specialist import GENERAL, Specialist
-from fgtutor.tensorization import Assessment, Taus, assess_all, resolve_taus, steps_on_known
+from fgtutor.tensorization import Assessment, assess_all
 
 Radius = Annotated[float, Interval(ge=0, le=10)]
 """How far something reaches, m."""
@@ -163,8 +163,8 @@ def _disc(radius: float, resolution: float) -> Bool[np.ndarray, "side side"]:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A map as planners see it: what is computed of it is computed once, whoever asks."""
+class AssessedMap:
+    """A map and what each policy says of it, computed when it is first asked for."""
 
     elevation: ElevationMap
     """The map that is planned on."""
@@ -185,74 +185,66 @@ class View:
         return next(iter(self.zoo.values())).grid.footprint[1]
 
     def assessment(self, name: str) -> Assessment:
-        """Return f and L_recon of one policy."""
+        """Return what one policy says."""
         if name not in self._known:
-            # The specialists share their patches. The generalist is assessed apart: who plans for
-            # the ones seldom asks for the other.
+            # The specialists share their patches. The generalist is assessed apart: few planners
+            # ask for both.
             team = [name] if name == GENERAL else self.specialists
             asked = {member: self.zoo[member] for member in team}
-            self._known.update(assess_all(self.elevation, asked))
+            self._known.update(assess_all(self.elevation, asked, self.taus))
         return self._known[name]
 
-    def f(self, name: str) -> Float[Tensor, "nx ny 8"]:
-        """Return f of one policy, 0 for steps from or to an unknown cell or off the map."""
-        return self._on_known(self.assessment(name).f)
-
-    def tensor(self, name: str) -> Float[Tensor, "nx ny 8"]:
-        """Return F_i of one policy, as `tensorize` does."""
-        low, high = resolve_taus(self.taus, self.zoo[name])
-        return self._on_known(self.assessment(name).weighted(low, high))
-
-    def _on_known(self, values: Float[Tensor, "nx ny 8"]) -> Float[Tensor, "nx ny 8"]:
-        return values * torch.from_numpy(steps_on_known(self.elevation.known))
+    def tensors(self, *names: str) -> "Layers":
+        """Return F_i of the named policies, of all specialists unless names are given."""
+        return {name: self.assessment(name).weighted() for name in names or self.specialists}
 
 
 Layers = dict[str, Float[Tensor, "nx ny 8"]]
 """F of each policy that may drive, by name."""
-Planner = Callable[[View], Sequence[Layers]]
+Planner = Callable[[AssessedMap], Sequence[Layers]]
 """Gives the layers to plan on; of several, the cheapest route is taken."""
+Cells = Callable[[ElevationMap, float], Float[np.ndarray, "nx ny"]]
+"""A classical map: one number per cell, for a robot of a radius, m."""
 
 
-def single(name: str, view: View) -> Sequence[Layers]:
+def single(name: str, ground: AssessedMap) -> Sequence[Layers]:
     """Plan for one policy, by its own tensor."""
-    return [{name: view.tensor(name)}]
+    return [ground.tensors(name)]
 
 
-def ours(view: View) -> Sequence[Layers]:
+def ours(ground: AssessedMap) -> Sequence[Layers]:
     """Plan for all specialists, fused (the paper)."""
-    return [{name: view.tensor(name) for name in view.specialists}]
+    return [ground.tensors()]
 
 
-def without_ood(view: View) -> Sequence[Layers]:
+def without_ood(ground: AssessedMap) -> Sequence[Layers]:
     """Ours without w_ood: believe each f wherever it is asked."""
-    return [{name: view.f(name) for name in view.specialists}]
+    assessments = {name: ground.assessment(name) for name in ground.specialists}
+    return [{name: one.closed(one.f) for name, one in assessments.items()}]
 
 
-def without_heading(view: View) -> Sequence[Layers]:
-    """Ours with one number a cell, the mean of F_i over the headings."""
-    layers = {name: view.tensor(name).mean(dim=-1) for name in view.specialists}
-    return [{name: _all_headings(layer) for name, layer in layers.items()}]
+def without_heading(ground: AssessedMap) -> Sequence[Layers]:
+    """Ours with one number per cell, the mean of F_i over the headings."""
+    tensors = ground.tensors()
+    return [{name: _all_headings(tensor.mean(dim=-1)) for name, tensor in tensors.items()}]
 
 
-def without_fusion(view: View) -> Sequence[Layers]:
+def without_fusion(ground: AssessedMap) -> Sequence[Layers]:
     """Ours without fusion: one specialist drives all the way, the one with the cheapest route."""
-    return [{name: view.tensor(name)} for name in view.specialists]
+    return [{name: tensor} for name, tensor in ground.tensors().items()]
 
 
-def classical(
-    cells: Callable[[ElevationMap, float], Float[np.ndarray, "nx ny"]], view: View
-) -> Sequence[Layers]:
+def classical(cells: Cells, ground: AssessedMap) -> Sequence[Layers]:
     """Plan on a classical map, which knows of no policies; the generalist drives."""
-    return [{GENERAL: _all_headings(torch.from_numpy(cells(view.elevation, view.radius)))}]
+    return [{GENERAL: _all_headings(torch.from_numpy(cells(ground.elevation, ground.radius)))}]
 
 
-def classical_switched(
-    cells: Callable[[ElevationMap, float], Float[np.ndarray, "nx ny"]], view: View
-) -> Sequence[Layers]:
+def classical_switched(cells: Cells, ground: AssessedMap) -> Sequence[Layers]:
     """Plan on a classical map; our policy map P says which specialist drives."""
-    layer = _all_headings(torch.from_numpy(cells(view.elevation, view.radius)))
-    _, policy_map = fuse([view.tensor(name) for name in view.specialists])
-    return [{name: layer * (policy_map == i) for i, name in enumerate(view.specialists)}]
+    layer = _all_headings(torch.from_numpy(cells(ground.elevation, ground.radius)))
+    tensors = ground.tensors()
+    _, policy_map = fuse(list(tensors.values()))
+    return [{name: layer * (policy_map == i) for i, name in enumerate(tensors)}]
 
 
 def _all_headings(values: Float[Tensor, "nx ny"]) -> Float[Tensor, "nx ny 8"]:
@@ -279,38 +271,23 @@ def planners(zoo: Mapping[str, Specialist]) -> dict[str, Planner]:
 
 def find_route(
     planner: Planner,
-    view: View,
-    start: tuple[float, float],
-    goal: tuple[float, float],
-    *,
-    f_min: float = 0.1,
-    switch_cost: float = 0.0,
-    cost: Cost = "inverse",
-) -> Route:
-    """Return the planner's cheapest route; its `names` are the policies that may drive it.
+    ground: AssessedMap,
+    start: Point,
+    goal: Point,
+    settings: PlanSettings | None = None,
+    **changes: Any,
+) -> Route | Refusal:
+    """Return the planner's cheapest route, whose `names` are the policies that may drive it.
 
-    `cost` is that of `planning.plan`.
-    Raises `PlanningError` if there is none, and `ConfigError` if the planner offers no layers.
+    `settings` and `changes` are those of `planning.plan`, but for the thresholds, which are the
+    map's. Raises `ConfigError` if the planner offers no layers.
     """
-    routes: list[Route] = []
-    refusal: PlanningError | None = None
-    for layers in planner(view):
-        team = {name: view.zoo[name] for name in layers}
-        try:
-            plan = plan_on_map(
-                view.elevation,
-                team,
-                start,
-                goal,
-                tensors=layers,
-                f_min=f_min,
-                switch_cost=switch_cost,
-                cost=cost,
-            )
-        except PlanningError as error:
-            refusal = error
-        else:
-            routes.append(plan.route)
-    if routes:
-        return min(routes, key=lambda route: route.cost)
-    raise refusal or ConfigError("this planner has no policy to plan for: the zoo is empty")
+    answers = []
+    for layers in planner(ground):
+        team = {name: ground.zoo[name] for name in layers}
+        options = {"settings": settings, "tensors": layers, **changes}
+        answers.append(plan_on_map(ground.elevation, team, start, goal, **options).answer)
+    if not answers:
+        raise ConfigError("this planner has no policy to plan for: the zoo is empty")
+    routes = [answer for answer in answers if isinstance(answer, Route)]
+    return min(routes, key=lambda route: route.cost, default=answers[-1])

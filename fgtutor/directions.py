@@ -7,6 +7,7 @@ is the only file that knows the order; everything else asks it.
 import math
 
 import numpy as np
+from jaxtyping import Bool
 
 NUM_HEADINGS = 8
 """d, the number of headings (paper, Sec. III-B)."""
@@ -24,6 +25,9 @@ NAMES = ("+x", "+x+y", "+y", "-x+y", "-x", "-x-y", "-y", "+x-y")
 """How figures and messages name the headings."""
 
 
-def opposite(heading: int) -> int:
-    """Return the heading that points the other way."""
-    return (heading + NUM_HEADINGS // 2) % NUM_HEADINGS
+def steps_within(usable: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "nx ny 8"]:
+    """Return which steps start from a usable cell and end on one; none leads off the map."""
+    nx, ny = usable.shape
+    around = np.pad(usable, 1, constant_values=False)
+    ends = [around[1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny] for dx, dy in STEPS]
+    return np.stack(ends, axis=-1) & usable[..., None]

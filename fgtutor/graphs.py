@@ -1,24 +1,31 @@
-"""The graphs that planning searches: one in networkx to read, the same one in scipy to be fast.
+"""The graphs that planning searches, and Dijkstra's search: networkx to read, scipy to be fast.
 
 Reads feasibility tensors [nx, ny, 8]; gives graphs whose nodes are cells, or cells with a policy
-once a change of policy costs something.
+once a change of policy costs something, and the cheapest chain of nodes between two cells.
 Source: paper, Sec. III-C (edge cost 1 / F_max). The switching cost is ours.
 """
 
+import math
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import permutations
 
 import networkx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
-from scipy.sparse import csr_array
+from scipy.sparse import csgraph, csr_array
 
 from fgtutor import directions
 from fgtutor.io.machine import require_memory
 
+Cell = tuple[int, int]
+
 READABLE_STEP, EDGE, STATE = 700, 14, 64
 """Bytes that a search needs: per step of a networkx graph, per edge and per state of scipy's (an
 index, a weight and its check; a node of its heap, a distance and the next state). Measured."""
+LOOSE = 1.25
+"""Beyond this multiple of the cost with free switching, a bound spares too few steps to pay."""
 STRIP_CELLS = 1 << 13
 """Cells whose edges are listed at a time."""
 _ORDER = np.argsort(directions.STEPS @ (-(1 << 20), -1))
@@ -114,13 +121,13 @@ def reversed_graph(
     them. Raises `TooLargeError` if the graph does not fit into memory.
     """
     count, nx, ny, _ = layers.shape
-    able = layers > 0
-    pairs = {
-        new: [(old, *_changes(able[old], able[new])) for old in range(count) if old != new]
-        for new in range(count)
+    able = np.packbits(layers > 0, axis=-1)  # one bit per heading: sets of steps as bytes
+    changes = {
+        (old, new): _changes(able[old], able[new]) for old, new in permutations(range(count), 2)
     }
-    total = int(np.count_nonzero(able)) + sum(
-        int(np.count_nonzero(part)) for rows in pairs.values() for _, *both in rows for part in both
+    total = int(np.count_nonzero(layers)) + sum(
+        int(np.count_nonzero(inside)) + int(np.bitwise_count(along).sum())
+        for inside, along in changes.values()
     )
     states = count * nx * ny
     require_memory(
@@ -130,36 +137,46 @@ def reversed_graph(
         fits=total < 2**31,  # scipy's search counts edges in 32 bits
     )
     columns, weights = np.empty(total, dtype=np.int32), np.empty(total)
-    starts, filled = [np.zeros(1, dtype=np.int32)], 0
-    for new, rows in pairs.items():
+    degrees, filled = [np.zeros(1, dtype=np.int32)], 0
+    into = np.append(-(directions.STEPS[_ORDER] @ (ny, 1)), 0)  # from a step's end to its start
+    for new in range(count):
         entering = _entering(layers[new])
-        along = [(old, inside, _entering(steps)) for old, inside, steps in rows]
+        there = [entering > 0]
+        tails = [new * nx * ny + into[:8]]
+        others = [old for old in range(count) if old != new]
+        for old in others:
+            # A ninth kind of edge stays in the cell and costs nothing but the change.
+            inside, along = changes[old, new]
+            there += [_entering(np.unpackbits(along, axis=-1).view(bool)), inside]
+            tails.append(old * nx * ny + into)
+        tail = np.concatenate(tails).astype(np.int32)
         for first in range(0, nx, max(1, STRIP_CELLS // ny)):
-            strip = slice(first, min(first + max(1, STRIP_CELLS // ny), nx))
-            ends, column, weight = _edges_into(
-                entering[strip],
-                [(old, inside[strip], steps[strip]) for old, inside, steps in along],
-                new=new,
-                switch_cost=switch_cost,
-                cost=cost,
-                resolution=resolution,
-                cells=(first * ny, nx * ny),
-            )
-            columns[filled : filled + len(column)] = column
-            weights[filled : filled + len(column)] = weight
-            starts.append((filled + ends).astype(np.int32))
-            filled += len(column)
+            strip = slice(first, first + max(1, STRIP_CELLS // ny))
+            mask = np.concatenate([part[strip] for part in there], axis=-1).reshape(-1, len(tail))
+            with np.errstate(divide="ignore"):  # where there is no step F is 0, and the mask False
+                step = step_cost(entering[strip], _ORDER, cost, resolution).reshape(-1, 8)
+            change = np.full((len(step), 9), float(switch_cost))
+            change[:, :8] += step
+            cells = np.arange(len(step), dtype=np.int32) + np.int32(first * ny)
+            chosen = np.flatnonzero(mask)
+            end = filled + len(chosen)
+            columns[filled:end] = (cells[:, None] + tail).ravel().take(chosen)
+            cost_of = np.concatenate([step] + [change] * len(others), axis=1)
+            weights[filled:end] = cost_of.ravel().take(chosen)
+            degrees.append(mask.sum(axis=1, dtype=np.int32))
+            filled = end
     graph = csr_array((states, states))
-    graph.indptr, graph.indices, graph.data = np.concatenate(starts), columns, weights
+    starts = np.cumsum(np.concatenate(degrees), dtype=np.int32)
+    graph.indptr, graph.indices, graph.data = starts, columns, weights
     return graph
 
 
 def _changes(
-    old: Bool[np.ndarray, "nx ny 8"], new: Bool[np.ndarray, "nx ny 8"]
-) -> tuple[Bool[np.ndarray, "nx ny"], Bool[np.ndarray, "nx ny 8"]]:
+    old: Int[np.ndarray, "nx ny 1"], new: Int[np.ndarray, "nx ny 1"]
+) -> tuple[Bool[np.ndarray, "nx ny 1"], Int[np.ndarray, "nx ny 1"]]:
     """Say where the policy may change for every step of the new one, and else for which steps."""
-    inside = np.asarray((old | ~new).all(axis=-1) & new.any(axis=-1))
-    return inside, old & new & ~inside[..., None]
+    inside = (new != 0) & (new & ~old == 0)
+    return inside, np.where(inside, 0, old & new).astype(np.uint8)
 
 
 def _entering(leaving: np.ndarray) -> np.ndarray:
@@ -170,38 +187,128 @@ def _entering(leaving: np.ndarray) -> np.ndarray:
     return moved
 
 
-def _edges_into(
-    feasibility: Float[np.ndarray, "rows ny 8"],
-    changes: list[tuple[int, np.ndarray, np.ndarray]],
-    *,
-    new: int,
-    switch_cost: float,
-    cost: str,
-    resolution: float,
-    cells: tuple[int, int],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """List the edges that end in a strip of one layer: their number up to each state, tail, weight.
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Dijkstra's search over layers of feasibility: one for free switching, else one per policy."""
 
-    `cells` are the first cell of the strip and the number of all cells. Steps stand in the order
-    of `_entering`.
-    """
-    first, layer = cells
-    steps = -(directions.STEPS[_ORDER] @ (feasibility.shape[1], 1))  # from its end to its start
-    # A ninth kind of edge stays in the cell and costs nothing but the change.
-    costs = np.zeros((feasibility[..., 0].size, 9))
-    with np.errstate(divide="ignore"):  # a step that is not there has F = 0, and is not taken
-        costs[:, :8] = step_cost(feasibility, _ORDER, cost, resolution).reshape(-1, 8)
-    # One slot for each edge that a state can have: is it there, its tail, its kind, its extra.
-    there, offset = [feasibility > 0], [new * layer + steps]
-    for old, inside, along in changes:
-        there += [along, inside[..., None]]
-        offset.append(old * layer + np.append(steps, 0))
-    offset = np.concatenate(offset)
-    kind = np.append(np.arange(8), np.tile(np.arange(9), len(changes)))
-    extra = np.where(np.arange(len(kind)) < 8, 0.0, switch_cost)
-    mask = np.concatenate(there, axis=-1).reshape(-1, len(kind))
-    count = np.count_nonzero(mask, axis=1)
-    cell = np.repeat(np.arange(len(mask)), count)
-    slot = np.flatnonzero(mask) - cell * len(kind)
-    weight = costs.ravel()[cell * 9 + kind[slot]] + extra[slot]
-    return count.cumsum(), cell + (first + offset)[slot], weight
+    layers: Float[np.ndarray, "layers nx ny 8"]
+    """F of each step, 0 where there is none."""
+    switch_cost: float
+    """Cost of changing the layer, in the unit of `cost`."""
+    cost: str
+    """Cost of a step, as in `step_cost`."""
+    resolution: float
+    """Side of a cell, m."""
+
+    def networkx(self, start: Cell, goal: Cell) -> Int[np.ndarray, "n 3"] | None:
+        """Search forwards in the graph that people read; answer as `scipy`."""
+        count = len(self.layers)
+        steps = int(np.count_nonzero(self.layers)) * count
+        cells = " x ".join(map(str, self.layers.shape[1:3]))
+        cure = f'{CURE}, or with backend="scipy"'
+        require_memory(steps * READABLE_STEP, f"a networkx graph of {cells} cells", cure)
+        # What is closed has F = 0: any limit above 0 leaves it out.
+        rules = {"f_min": np.finfo(float).tiny, "cost": self.cost, "resolution": self.resolution}
+        if count > 1:
+            graph = as_switching_networkx(self.layers, self.switch_cost, **rules)
+        else:
+            graph = as_networkx(self.layers[0], np.zeros(self.layers[0].shape, int), **rules)
+        sources, targets = (
+            [(*cell, layer) for layer in range(count)] if count > 1 else [cell]
+            for cell in (start, goal)
+        )
+        # Any policy may arrive: free edges lead from all of them to one last node.
+        graph.add_edges_from(((target, "goal") for target in targets), weight=0.0)
+        try:
+            _, path = networkx.multi_source_dijkstra(graph, sources, target="goal")
+        except networkx.NetworkXNoPath:
+            return None
+        nodes = [tuple(node) for node in path if node != "goal"]
+        return np.array([(*node[2:], *node[:2]) if count > 1 else (0, *node) for node in nodes])
+
+    def scipy(self, start: Cell, goal: Cell) -> Int[np.ndarray, "n 3"] | None:
+        """Return the cheapest chain of (layer, ix, iy), or None; searched backwards from the goal.
+
+        With several layers it is searched only where it can lie. Switching for free is a graph with
+        fewer nodes; driving its cheapest route with the best policies for it, every switch paid,
+        costs `bound`. A step is of no use if the cheapest way to it, the step itself and the
+        cheapest way on to the goal cost more than that even with free switching.
+        """
+        best = Search(self.layers.max(axis=0)[None], 0.0, self.cost, self.resolution)
+        graph = best._reversed()
+        free, distance = best._backwards(graph, start, goal)
+        if free is None or len(self.layers) == 1:
+            return free
+        # Sums in another order differ in the last digits: nothing may be lost to that.
+        bound = self._cost_along(free[:, 1:]) * (1 + 1e-9)
+        if bound > LOOSE * distance.reshape(best.layers.shape[1:3])[start]:
+            return self._backwards(self._reversed(), start, goal, bound)[0]
+        keep = best._within(graph, start, distance, bound)
+        used = np.append(np.argwhere(keep)[:, :2], [goal], axis=0)
+        low, high = used.min(axis=0), used.max(axis=0)
+        window = tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))
+        part = np.where(keep[window], self.layers[(slice(None), *window)], 0)
+        narrowed = replace(self, layers=part)
+        ends = _minus(start, low), _minus(goal, low)
+        states, _ = narrowed._backwards(narrowed._reversed(), *ends, bound)
+        return None if states is None else states + np.array([0, *low])
+
+    def _reversed(self) -> csr_array:
+        return reversed_graph(self.layers, self.switch_cost, self.cost, self.resolution)
+
+    def _backwards(
+        self, graph: csr_array, start: Cell, goal: Cell, limit: float = math.inf
+    ) -> tuple[Int[np.ndarray, "n 3"] | None, Float[np.ndarray, " states"]]:
+        """Search from the goal to every state nearer than `limit`: the chain, all distances."""
+        count, nx, ny = shape = self.layers.shape[:3]
+        first, last = (np.arange(count) * nx * ny + ix * ny + iy for ix, iy in (start, goal))
+        distance, towards, _ = csgraph.dijkstra(
+            graph, indices=last, return_predecessors=True, min_only=True, limit=limit
+        )
+        if not np.isfinite(distance[first]).any():
+            return None, distance
+        states = [int(first[distance[first].argmin()])]
+        while (state := int(towards[states[-1]])) >= 0:
+            states.append(state)
+        return np.stack(np.unravel_index(states, shape), axis=-1), distance
+
+    def _cost_along(self, cells: Int[np.ndarray, "n 2"]) -> float:
+        """Return the least cost of driving along `cells`; infinite if policies cannot hand over."""
+        headings = headings_of(cells)
+        f = self.layers[:, cells[:-1, 0], cells[:-1, 1], headings]
+        with np.errstate(divide="ignore"):
+            costs = step_cost(f, headings, self.cost, self.resolution)
+        least = np.zeros(len(f))
+        for cost in costs.T:  # a change needs the old and the new policy to be able to take a step
+            able = np.isfinite(cost)
+            if not able.any():
+                return math.inf
+            least = cost + np.minimum(least, least[able].min() + self.switch_cost)
+        return float(least.min())
+
+    def _within(
+        self, graph: csr_array, start: Cell, distance: Float[np.ndarray, " cells"], bound: float
+    ) -> Bool[np.ndarray, "nx ny 8"]:
+        """Return the steps of the only layer that lie on a chain which costs `bound` or less."""
+        layer = self.layers[0]
+        shape = layer.shape[:2]
+        first = int(np.ravel_multi_index(start, shape))
+        there = csgraph.dijkstra(graph.T.tocsr(), indices=first, limit=bound).reshape(shape)
+        onward = distance.reshape(shape)
+        keep = layer > 0
+        with np.errstate(divide="ignore"):
+            for heading, tail, head in steps_of(shape):
+                cost = step_cost(layer[(*tail, heading)], heading, self.cost, self.resolution)
+                keep[(*tail, heading)] &= there[tail] + cost + onward[head] <= bound
+        return keep
+
+
+def headings_of(cells: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, " steps"]:
+    """Return the heading of each step of a chain of neighbouring cells."""
+    steps = np.diff(cells, axis=0)
+    return np.equal(steps[:, None], directions.STEPS).all(axis=-1).argmax(axis=-1)
+
+
+def _minus(cell: Cell, corner: np.ndarray) -> Cell:
+    """Count a cell from a corner of the map."""
+    return int(cell[0] - corner[0]), int(cell[1] - corner[1])

@@ -1,4 +1,4 @@
-"""The route: what planning found, step by step, with the reasons.
+"""The answer of planning: a route, step by step with the reasons, or a refusal with its reason.
 
 Reads the cells, policies and numbers that `planning` chose; gives lengths, switches, explanations
 and JSON. Source: paper, Sec. III-C ("full transparency in policy selection decisions").
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NoReturn, Self
 
 import numpy as np
 from annotated_types import Interval, Len
@@ -20,6 +20,32 @@ from fgtutor.io.validation import parse_record
 
 LARGEST = 1e12
 """The largest number in a route; sums of larger ones lose their metres, or overflow."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refusal:
+    """There is no route, and why; as a condition it is False."""
+
+    error: PlanningError
+    """The reason, by its type: `UnknownCellError`, `InfeasibleCellError`, `UnreachableError`."""
+
+    @property
+    def reason(self) -> str:
+        """The reason in words: which place, why, and what to change."""
+        return str(self.error)
+
+    def raise_for(self) -> NoReturn:
+        """Raise the reason; a `Route` returns itself."""
+        raise self.error
+
+    def __bool__(self) -> bool:
+        return False
+
+    def __getattr__(self, name: str) -> NoReturn:
+        raise AttributeError(f"there is no route, so no {name!r}: {self.__dict__.get('error')}")
+
+    def __repr__(self) -> str:
+        return f"Refusal({self.error})"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,6 +111,10 @@ class Route:
     def switches(self) -> int:
         """How often the policy changes on the way."""
         return int(np.count_nonzero(np.diff(self.policies)))
+
+    def raise_for(self) -> Self:
+        """Return the route; a `Refusal` raises its reason."""
+        return self
 
     def explain(self) -> list[dict[str, Any]]:
         """Say for every step where it goes, with which policy, and what the others offered."""

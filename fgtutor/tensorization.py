@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from fgtutor import directions, patches
@@ -33,13 +33,12 @@ from fgtutor.feasibility import TAU_HIGH, TAU_LOW, calibrated_taus, ood_weight
 from fgtutor.grid import point_text
 from fgtutor.io.machine import require_memory
 from fgtutor.io.progress import watch
+from fgtutor.settings import Taus, Unknown
 
 if TYPE_CHECKING:
     from fgtutor.specialist import Specialist
 
-Taus = Literal["paper", "calibrated"] | tuple[float, float]
 Method = Literal["auto", "reference", "fast"]
-Unknown = Literal["block", "fill"]
 
 STRIP_CELLS = 2048
 """Cells assessed at a time: 187 points of each are 1.5 MB. The speed hardly depends on it."""
@@ -47,99 +46,113 @@ STRIP_CELLS = 2048
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """What one specialist says about every cell and heading of a map, before any threshold."""
+    """What one specialist says about every cell and heading of a map."""
 
     f: Float[Tensor, "nx ny 8"]
     """Feasibility f, the predicted r_v in [0, 1]."""
     reconstruction: Float[Tensor, "nx ny 8"]
-    """L_recon, m^2 summed over the patch."""
+    """L_recon, summed over the patch in the units the VAE sees (metres times `height_scale`)."""
+    elevation: ElevationMap
+    """The map that was assessed."""
+    taus: tuple[float, float] = (TAU_LOW, TAU_HIGH)
+    """Thresholds of w_ood: the specialist's own, unless others were asked for."""
+    specialist: Specialist | None = None
+    """Whose assessment it is; None for numbers made by hand."""
 
-    def ood(self, tau_low: float = TAU_LOW, tau_high: float = TAU_HIGH) -> Tensor:
-        """Return w_ood (Eq. 4), [nx, ny, 8]."""
-        return ood_weight(self.reconstruction, tau_low, tau_high)
+    def ood(self, tau_low: float | None = None, tau_high: float | None = None) -> Tensor:
+        """Return w_ood (Eq. 4), [nx, ny, 8], by `taus` unless thresholds are given."""
+        low, high = self.taus
+        low, high = low if tau_low is None else tau_low, high if tau_high is None else tau_high
+        return ood_weight(self.reconstruction, low, high)
 
-    def weighted(self, tau_low: float = TAU_LOW, tau_high: float = TAU_HIGH) -> Tensor:
-        """Return F_i = w_ood * f (Eq. 5), [nx, ny, 8]."""
-        return self.ood(tau_low, tau_high) * self.f
+    def weighted(
+        self,
+        tau_low: float | None = None,
+        tau_high: float | None = None,
+        *,
+        unknown: Unknown = "block",
+    ) -> Float[Tensor, "nx ny 8"]:
+        """Return F_i = w_ood * f (Eq. 5), by `taus` unless thresholds are given.
+
+        It is 0 where a step would start from or end on an unknown cell, or leave the map;
+        `unknown="fill"` trusts the filled heights instead.
+        """
+        weighted = self.ood(tau_low, tau_high) * self.f
+        return self.closed(weighted) if unknown == "block" else weighted
+
+    def closed(self, values: Float[Tensor, "nx ny 8"]) -> Float[Tensor, "nx ny 8"]:
+        """Return `values`, 0 for steps from or to an unknown cell or off the map."""
+        return values * torch.from_numpy(self.elevation.known_steps)
 
 
 def tensorize(
     elevation: ElevationMap,
     specialist: Specialist,
     *,
-    taus: Taus = "paper",
+    taus: Taus = "calibrated",
     method: Method = "auto",
     unknown: Unknown = "block",
     progress: bool = False,
 ) -> Float[Tensor, "nx ny 8"]:
     """Return F_i(x, y, k) = w_ood * f: how well this specialist leaves a cell along heading k.
 
-    `taus` is "paper", "calibrated" (from the specialist's own terrain) or a pair (low, high). With
-    `unknown="block"` F is zero wherever a step would start from or end on an unknown cell, or leave
-    the map; "fill" trusts the filled heights instead. `progress` shows a bar if it takes long.
+    `taus` is "calibrated" (the specialist's own), "paper" or a pair (low, high), `unknown` as in
+    `Assessment.weighted`, `progress` shows a bar if it takes long.
 
     Raises:
         ThresholdError, ConfigError: A setting has a value without meaning.
         TooLargeError: The tensors do not fit into memory.
     """
-    settings: dict = {"taus": taus, "method": method, "unknown": unknown, "progress": progress}
-    return tensorize_all(elevation, {"": specialist}, **settings)[""]
-
-
-def tensorize_all(
-    elevation: ElevationMap,
-    zoo: Mapping[str, Specialist],
-    *,
-    taus: Taus = "paper",
-    method: Method = "auto",
-    unknown: Unknown = "block",
-    progress: bool = False,
-) -> dict[str, Float[Tensor, "nx ny 8"]]:
-    """Return F_i of each policy of `zoo`: what `tensorize` gives, in less time (`assess_all`)."""
     if unknown not in get_args(Unknown):
         raise ConfigError(f"unknown must be one of {', '.join(get_args(Unknown))}, got {unknown!r}")
-    thresholds = {name: resolve_taus(taus, specialist) for name, specialist in zoo.items()}
-    said = assess_all(elevation, zoo, method, progress=progress)
-    # One policy after the other, so that only one tensor more than they say is ever kept.
-    tensors = {name: said.pop(name).weighted(*thresholds[name]) for name in zoo}
-    if unknown == "block":
-        closed = ~torch.from_numpy(steps_on_known(elevation.known))
-        for tensor in tensors.values():
-            tensor[closed] = 0
-    return tensors
+    assessment = assess(elevation, specialist, taus=taus, method=method, progress=progress)
+    return assessment.weighted(unknown=unknown)
 
 
-def assess(elevation: ElevationMap, specialist: Specialist, method: Method = "auto") -> Assessment:
+def assess(
+    elevation: ElevationMap,
+    specialist: Specialist,
+    *,
+    taus: Taus = "calibrated",
+    method: Method = "auto",
+    progress: bool = False,
+) -> Assessment:
     """Return f and L_recon of every cell and heading; unknown cells are read as filled.
 
     Give the map as it was loaded: it is prepared for patches here. "auto" is the fast way, which
-    won on every map measured. Raises `ConfigError` for another method.
+    won on every map measured. Raises what `tensorize` raises.
     """
-    return assess_all(elevation, {"": specialist}, method)[""]
+    zoo = {specialist.name: specialist}
+    return assess_all(elevation, zoo, taus, method, progress=progress)[specialist.name]
 
 
 @torch.no_grad()
 def assess_all(
     elevation: ElevationMap,
     zoo: Mapping[str, Specialist],
+    taus: Taus = "calibrated",
     method: Method = "auto",
     *,
     progress: bool = False,
 ) -> dict[str, Assessment]:
     """Return what each policy of `zoo` says; those with the same patch grid share its patches.
 
-    `progress` shows a bar if it takes long. Raises what `assess` raises.
+    The numbers are those of `assess`, in less time. Raises what `tensorize` raises.
     """
     if method not in _WAYS:
         raise ConfigError(f"method must be one of {', '.join(_WAYS)}, got {method!r}")
+    thresholds = {name: resolve_taus(taus, specialist) for name, specialist in zoo.items()}
     nx, ny = elevation.shape
     work = f"assessing {nx} x {ny} cells for {len(zoo)} polic{'y' if len(zoo) == 1 else 'ies'}"
     # f and L_recon in 4 bytes each, and one F_i.
     needed = 4.0 * nx * ny * directions.NUM_HEADINGS * (2 * len(zoo) + 1)
     require_memory(needed, work, "take a part of the map (ElevationMap.crop) or coarser cells")
     heights = patches.prepare(elevation).heights
-    blank = torch.empty(2, nx, ny, directions.NUM_HEADINGS)
-    said = {name: Assessment(*blank.clone()) for name in zoo}
+    blank = torch.empty(nx, ny, directions.NUM_HEADINGS)
+    assessments = {
+        name: Assessment(blank.clone(), blank.clone(), elevation, thresholds[name], specialist)
+        for name, specialist in zoo.items()
+    }
     grids = {specialist.grid for specialist in zoo.values()}
     tiles = (
         (grid, heading, rows, patch)
@@ -153,13 +166,13 @@ def assess_all(
         for name, specialist in zoo.items():
             if specialist.grid != grid:
                 continue
-            net, one = specialist.feasibility, said[name]
+            net, one = specialist.feasibility, assessments[name]
             command = torch.tensor(specialist.command, dtype=torch.float32)
             f = net.feasibility(distinct, command.expand(len(distinct), -1))
             one.f[rows, :, heading] = f[cells].reshape(-1, ny)
             loss = net.reconstruction(distinct)
             one.reconstruction[rows, :, heading] = loss[cells].reshape(-1, ny)
-    return said
+    return assessments
 
 
 def resolve_taus(taus: Taus, specialist: Specialist) -> tuple[float, float]:
@@ -184,19 +197,16 @@ def resolve_taus(taus: Taus, specialist: Specialist) -> tuple[float, float]:
 
 
 def why_blocked(
-    x: float,
-    y: float,
-    *,
-    elevation: ElevationMap,
-    assessments: Mapping[str, Assessment],
-    taus: Mapping[str, tuple[float, float]] | None = None,
-    f_min: float = 0.1,
+    x: float, y: float, assessments: Mapping[str, Assessment], *, f_min: float = 0.1
 ) -> str:
     """Say which layer closes the cell at (x, y), m: the map, unknown cells, f or w_ood.
 
-    `assessments` holds each policy's `assess` of the map and `taus` each one's thresholds (default:
-    the paper's). A cell is closed when no policy can leave it with F >= f_min.
+    `assessments` holds what each policy says of one map (`assess_all`). A cell is closed when no
+    policy can leave it with F >= f_min. Raises `ConfigError` if there is no assessment.
     """
+    if not assessments:
+        raise ConfigError("without an assessment nothing is known of the map: give assess_all's")
+    elevation = next(iter(assessments.values())).elevation
     place = f"{point_text((x, y), elevation.resolution)} m"
     if not elevation.contains(x, y):
         return f"{place} is off the map."
@@ -204,13 +214,12 @@ def why_blocked(
     where = f"Cell {cell} at {place}"
     if not elevation.known[cell]:
         return f"{where} is closed: it was never observed."
-    open_headings = np.flatnonzero(steps_on_known(elevation.known)[cell])
+    open_headings = np.flatnonzero(elevation.known_steps[cell])
     if not len(open_headings):
         return f"{where} is closed: all its neighbours are unknown or off the map."
     reasons = []
     for name, assessment in assessments.items():
-        f = assessment.f[cell][open_headings]
-        w_ood = assessment.ood(*(taus or {}).get(name, (TAU_LOW, TAU_HIGH)))[cell][open_headings]
+        f, w_ood = assessment.f[cell][open_headings], assessment.ood()[cell][open_headings]
         best = int((w_ood * f).argmax())
         towards = directions.NAMES[open_headings[best]]
         if w_ood[best] * f[best] >= f_min:
@@ -226,14 +235,6 @@ def why_blocked(
                 f"but w_ood only {w_ood.max():.2f})"
             )
     return f"{where} is closed at f_min = {f_min:g}: {'; '.join(reasons)}."
-
-
-def steps_on_known(known: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "nx ny 8"]:
-    """Say for which headings both a cell and its neighbour are known and on the map."""
-    nx, ny = known.shape
-    around = np.pad(known, 1, constant_values=False)
-    ends = [around[1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny] for dx, dy in directions.STEPS]
-    return np.stack(ends, axis=-1) & known[..., None]
 
 
 def _strips(shape: tuple[int, int]) -> Iterator[slice]:

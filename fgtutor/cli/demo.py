@@ -13,15 +13,15 @@ import torch
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import RenderingError
-from fgtutor.execution import execute
+from fgtutor.execution import FollowConfig, execute
 from fgtutor.figures.maps import plan_figure, save_figure
 from fgtutor.figures.videos import film_strip, save_video
 from fgtutor.io.progress import waiting
 from fgtutor.io.storage import atomic_write, make_folder, write_json
-from fgtutor.io.validation import NonNegative, Seed, check_fields
-from fgtutor.pipeline import plan_on_map
+from fgtutor.io.validation import Seed, check_fields
+from fgtutor.planning import plan_on_map
+from fgtutor.settings import PlanOptions
 from fgtutor.specialist import load_zoo
-from fgtutor.tensorization import assess_all, resolve_taus, steps_on_known
 from fgtutor.world.terrain import Terrain, make_terrain
 
 ROBOT = "a1"
@@ -35,7 +35,7 @@ COURSE = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoConfig:
+class DemoConfig(PlanOptions):
     """Plan over a mixed terrain with the shipped specialists, drive the route, and draw both."""
 
     robot: Literal["a1", "toy"] = ROBOT
@@ -46,10 +46,6 @@ class DemoConfig:
     """Seed of the robot's start position and yaw."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped ones."""
-    taus: Literal["paper", "calibrated"] = "calibrated"
-    """Thresholds of w_ood: the paper's, or each specialist's own."""
-    switch_cost: NonNegative = 1.0
-    """Extra cost of changing the policy; at the paper's 0 equals take turns from cell to cell."""
     video: Literal["mp4", "gif"] = "mp4"
     """Format of the film."""
 
@@ -71,23 +67,18 @@ def run(config: DemoConfig) -> int:
     elevation = terrain.elevation
     print(f"{elevation}\nspecialists: {', '.join(zoo)}", flush=True)
 
-    closed = ~torch.from_numpy(steps_on_known(elevation.known))
-    weights, tensors = {}, {}
-    for name, assessment in assess_all(elevation, zoo, progress=True).items():
-        taus = resolve_taus(config.taus, zoo[name])
-        weights[name], tensors[name] = assessment.ood(*taus), assessment.weighted(*taus)
-        tensors[name][closed] = 0
-    ends = terrain.start, terrain.goal
-    plan = plan_on_map(
-        elevation, zoo, *ends, tensors=tensors, cost="length", switch_cost=config.switch_cost
-    )
+    with torch.inference_mode():
+        plan = plan_on_map(
+            elevation, zoo, terrain.start, terrain.goal, settings=config.planning, progress=True
+        )
     write_json(config.out / "route.json", plan.route.to_json())
     announce("route.json", str(plan.route))
-    save_figure(plan_figure(elevation, plan, weights), config.out / "plan.png")
+    save_figure(plan_figure(elevation, plan, plan.weights), config.out / "plan.png")
     announce("plan.png", "the map and route, w_ood, F_max and the policy map")
 
     with waiting("driving the route"):
-        episode = execute(plan.route, terrain, zoo, seed=config.seed)
+        follow = FollowConfig(hold_steps=config.planning.hold_steps)
+        episode = execute(plan.route, terrain, zoo, seed=config.seed, config=follow)
     try:
         with waiting("drawing the film"):
             film = save_video(episode, terrain, plan.route, config.out / f"drive.{config.video}")

@@ -3,24 +3,23 @@
 Reads a map and a zoo; prints the route, or why there is none, and writes it as JSON.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
-from annotated_types import Interval
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.io.storage import check_writable, write_json
-from fgtutor.io.validation import NonNegative, Unique, check_fields
-from fgtutor.pipeline import plan_on_map
-from fgtutor.planning import Backend, Cost, Point
+from fgtutor.io.validation import Unique, check_fields
+from fgtutor.planning import Point, plan_on_map
+from fgtutor.settings import Backend, PlanOptions
 from fgtutor.specialist import Specialist, load_zoo
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanConfig:
+class PlanConfig(PlanOptions):
     """Plan a route over an elevation map with the shipped specialists."""
 
     map: Path
@@ -35,15 +34,6 @@ class PlanConfig:
     """Folder of specialist folders; default: the shipped zoo of the robot."""
     policies: Annotated[tuple[str, ...], Unique] = ()
     """Use only these specialists; default: all."""
-    taus: Literal["paper", "calibrated"] = "calibrated"
-    """Thresholds of w_ood: the paper's, or each specialist's own."""
-    f_min: Annotated[float, Interval(gt=0, le=1)] = 0.1
-    """Edges less feasible than this do not exist."""
-    cost: Cost = "length"
-    """Edge cost: 1 / F_max times the step's length, or 1 / F_max alone (the paper)."""
-    switch_cost: NonNegative = 0.0
-    """Extra cost of changing the policy, in the unit of `cost` (metres or steps where F is 1); 0 is
-    the paper's."""
     backend: Backend = "auto"
     """Which library searches."""
     json: Path | None = None
@@ -68,17 +58,9 @@ def run(config: PlanConfig) -> int:
     elevation = ElevationMap.load(config.map)
     zoo = choose(load_zoo(config.robot, config.zoo), config.policies)
     with torch.inference_mode():
+        settings = replace(config.planning, backend=config.backend)
         planned = plan_on_map(
-            elevation,
-            zoo,
-            config.start,
-            config.goal,
-            taus=config.taus,
-            f_min=config.f_min,
-            cost=config.cost,
-            backend=config.backend,
-            switch_cost=config.switch_cost,
-            progress=True,
+            elevation, zoo, config.start, config.goal, settings=settings, progress=True
         )
     print(planned.route)
     if config.json:

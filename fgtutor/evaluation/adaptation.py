@@ -19,11 +19,10 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
-from fgtutor.pipeline import plan_on_map
 from jaxtyping import Float
 from torch import Tensor
 
-from fgtutor.errors import PlanningError, TerrainError
+from fgtutor.errors import TerrainError
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.planned import PlannedConfig
 from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
@@ -34,12 +33,11 @@ from fgtutor.execution import execute_batch
 from fgtutor.figures.maps_svg import draw_maps
 from fgtutor.io.validation import Count, check_arguments
 from fgtutor.io.validation import Share as Fraction
-from fgtutor.planning import plan
+from fgtutor.planning import plan, plan_on_map
 from fgtutor.robots import ROBOTS
 from fgtutor.routes import Route
 from fgtutor.specialist import ZOO, Specialist
 from fgtutor.statistics import Share, spl
-from fgtutor.tensorization import tensorize
 from fgtutor.world.obstacles import Course
 from fgtutor.world.terrain import Section, Terrain, TerrainSeed, rasterise
 
@@ -155,14 +153,18 @@ def geodesic(terrain: Terrain) -> float:
     """
     open_ = np.where(terrain.elevation.heights < WALL - 1e-3, 1.0, 0.0)
     free = np.repeat(open_[..., None], 8, axis=-1)
-    return plan(
-        free,
-        np.zeros(free.shape, dtype=int),
-        grid=terrain.elevation,
-        start=terrain.start,
-        goal=terrain.goal,
-        cost="length",
-    ).length
+    return (
+        plan(
+            free,
+            np.zeros(free.shape, dtype=int),
+            grid=terrain.elevation,
+            start=terrain.start,
+            goal=terrain.goal,
+            cost="length",
+        )
+        .raise_for()
+        .length
+    )
 
 
 def way_of(xy: Float[np.ndarray, "n 2"], terrain: Terrain) -> str | None:
@@ -181,20 +183,14 @@ def find_plans(
     """Return each checkpoint's tensor on a map and its route, None where there is no way for it."""
     plans = {}
     for name, specialist in zoo.items():
-        tensor = tensorize(terrain.elevation, specialist, taus=config.taus)
-        try:
-            route = plan_on_map(
-                terrain.elevation,
-                {name: specialist},
-                terrain.start,
-                terrain.goal,
-                f_min=config.f_min,
-                cost=config.cost,
-                tensors={name: tensor},
-            ).route
-        except PlanningError:
-            route = None
-        plans[name] = tensor, route
+        plan = plan_on_map(
+            terrain.elevation,
+            {name: specialist},
+            terrain.start,
+            terrain.goal,
+            settings=config.planning,
+        )
+        plans[name] = plan.fused, plan.answer or None
     return plans
 
 
@@ -327,8 +323,8 @@ def run(config: AdaptationConfig) -> int:
             table=table(summaries(trials, list(zoo)), zoo),
             caption=(
                 f"{config.trials:,} trials a checkpoint on {len(tasks)} maps, with 95 % intervals; "
-                f"robot {config.robot}, tau {config.taus}, f_min {config.f_min:g}, "
-                f"cost {config.cost}, seed {config.seed}. SPL against the straight line of "
+                f"robot {config.robot}, {config.planning}, seed {config.seed}. SPL against the "
+                f"straight line of "
                 f"{STRAIGHT:g} m, as the paper's numbers imply, and against the shortest way over "
                 f"no wall, {geodesic(first):.1f} m."
             ),

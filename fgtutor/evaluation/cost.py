@@ -69,7 +69,9 @@ def estimate(
         assessed = time.perf_counter()
         free = np.ones((*sample.elevation.shape, 8))
         start, goal = sample.start, sample.goal
-        route = plan(free, 0 * free, grid=sample.elevation, start=start, goal=goal, names=[name])
+        route = plan(
+            free, 0 * free, grid=sample.elevation, start=start, goal=goal, names=[name]
+        ).raise_for()
         execute_batch(
             [route] * at_once,
             [sample] * at_once,

@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
 
-from fgtutor.baselines import Layers, View, ours
+from fgtutor.baselines import AssessedMap, Layers, ours
 from fgtutor.errors import ConfigError, EvaluationError
 from fgtutor.evaluation import success
 from fgtutor.evaluation.provenance import digest
@@ -117,10 +117,7 @@ def run_task(
             grounds,
             {stage: partial(_ours_noted, digests)},
             zoo,
-            taus=config.taus,
-            f_min=config.f_min,
-            switch_cost=config.switch_cost,
-            cost=config.cost,
+            settings=config.planning,
         )
         # Planned in the order of the grounds, once each.
         noted = {g.terrain.seed: d for g, d in zip(grounds, digests, strict=True)}
@@ -128,9 +125,9 @@ def run_task(
     return rows
 
 
-def _ours_noted(digests: list[dict[str, str]], view: View) -> Sequence[Layers]:
+def _ours_noted(digests: list[dict[str, str]], ground: AssessedMap) -> Sequence[Layers]:
     """Plan as ours does, and note a digest of each tensor that is planned on."""
-    (layers,) = ours(view)
+    (layers,) = ours(ground)
     digests.append(
         {name: digest(tensor.contiguous().numpy().tobytes()) for name, tensor in layers.items()}
     )

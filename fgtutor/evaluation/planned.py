@@ -6,31 +6,22 @@ Source: paper, Sec. III-B (taus) and III-C (edge cost, f_min).
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
-
-from annotated_types import Interval
 
 from fgtutor.evaluation.provenance import digest
 from fgtutor.evaluation.shards import RunConfig
 from fgtutor.io.validation import Seed
+from fgtutor.settings import PlanOptions
 from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlannedConfig(RunConfig):
+class PlannedConfig(PlanOptions, RunConfig):
     """Which specialists plan, and by what rules."""
 
     robot: str = "toy"
     """Which robot."""
     seed: Seed = 0
     """What grounds and starts are drawn from."""
-    taus: Literal["paper", "calibrated"] = "calibrated"
-    """Thresholds of w_ood."""
-    f_min: Annotated[float, Interval(gt=0, le=1)] = 0.1
-    """Edges less feasible than this do not exist."""
-    cost: Literal["inverse", "length"] = "length"
-    """Edge cost: 1 / F times the step's length; or 1 / F alone (the paper), by which a diagonal
-    step costs as much as a straight one and routes zigzag."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped zoo."""
 

@@ -77,9 +77,6 @@ def run_and_report(
             )
         with watched or nullcontext():
             run = collect(tasks, settings, config, progress=True)
-        if not run.complete:
-            print(f"{run}; give the other parts' folders to --merge for the table")
-            return 0
         found = find(run.rows)
         print(f"{found.table}\n\n{found.caption}")
         if config.out:
@@ -113,7 +110,7 @@ def write_report(
         "title": title,
         "settings": settings,
         "trials": len(rows),
-        "tasks": run.tasks,
+        "tasks": len(run.results),
         "machines": run.machines,
         "task_seconds": round(run.seconds, 1),
         "wall_seconds": round(time.time() - began, 1),

@@ -1,31 +1,27 @@
-"""Keeping what an evaluation has finished: one file a task, so that a run can be taken up again.
+"""Keeping what an evaluation has finished: one file per task, so that an interrupted run goes on.
 
 Reads the tasks of a run and the settings that its rows depend on; gives all rows in the order of
 the tasks, wherever and whenever each was done. A report folder holds
 
     settings.json        what the rows depend on: a run with other settings may not go on in it
     shards/<task>.json   the rows of a finished task, its seconds and its machine
-
-Several machines share the work with `--part 1 2` and `--part 2 2`, each into a folder of its own;
-then the same command with `--merge FOLDER FOLDER` has all shards and writes the whole table.
 """
 
-import dataclasses
+import hashlib
 import json
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
 from fgtutor import __version__
-from fgtutor.errors import ConfigError, ReportError
+from fgtutor.errors import ReportError
 from fgtutor.evaluation.tasks import Result, Row, Task, run_tasks
 from fgtutor.io.storage import LOCK, make_folder, write_json
-from fgtutor.io.validation import Count, CountOrZero, NonNegative, check_fields, read_record
+from fgtutor.io.validation import CountOrZero, NonNegative, check_fields, read_record
 
-T = TypeVar("T")
 SETTINGS, SHARDS = "settings.json", "shards"
 
 
@@ -39,18 +35,9 @@ class RunConfig:
     """Address of a Ray cluster to run on instead: HOST:PORT, auto, or local."""
     out: Path | None = None
     """Report folder. Finished tasks are kept in it, and the same command goes on from there."""
-    part: tuple[Count, Count] = (1, 1)
-    """Do only this part of the tasks: 2 4 is the second of four."""
-    merge: tuple[Path, ...] = ()
-    """Report folders of other parts: their finished tasks are taken over."""
 
     def __post_init__(self) -> None:
         check_fields(self)
-        which, of = self.part
-        if which > of:
-            raise ConfigError(f"part: there is no part {which} of {of}")
-        if of > 1 and self.out is None:
-            raise ConfigError("a part is of use only in a folder: say --out FOLDER as well")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,19 +53,12 @@ class _Shard:
         json.dumps([self.rows, self.machine], allow_nan=False)  # ValueError for no number
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Run:
-    """What has been done of an evaluation."""
+    """A finished evaluation."""
 
-    tasks: int
-    """How many tasks it has."""
-    results: tuple[Result, ...]
-    """Those that are finished, in the order of the tasks."""
-
-    @property
-    def complete(self) -> bool:
-        """Whether no task is missing."""
-        return len(self.results) == self.tasks
+    results: Sequence[Result]
+    """What each task gave, in the order of the tasks."""
 
     @property
     def rows(self) -> list[Row]:
@@ -95,8 +75,10 @@ class Run:
         """The different machines that took part."""
         return list({json.dumps(r.machine): r.machine for r in self.results}.values())
 
-    def __repr__(self) -> str:
-        return f"{len(self.results)} of {self.tasks} tasks done, in {self.seconds / 3600:.2f} h"
+
+def digest(data: bytes) -> str:
+    """Return what tells one policy or tensor from another: the first 16 digits of its sha256."""
+    return hashlib.sha256(data).hexdigest()[:16]
 
 
 def settings_of(
@@ -108,9 +90,9 @@ def settings_of(
     `without` names other fields that change no row: where every trial has a ground of its own, a
     folder of 100 trials is the beginning of one of 200.
     """
-    own = {field.name for field in dataclasses.fields(RunConfig)} | {"json", "zoo", *without}
-    fields = {name: value for name, value in asdict(config).items() if name not in own}
-    settings = {"command": command, "fgtutor": __version__, **fields, **more}
+    own = {field.name for field in fields(RunConfig)} | {"json", "zoo", *without}
+    shared = {name: value for name, value in asdict(config).items() if name not in own}
+    settings = {"command": command, "fgtutor": __version__, **shared, **more}
     return json.loads(json.dumps(settings, default=str))  # as a file gives it back
 
 
@@ -124,75 +106,56 @@ def collect(
     """Do what is left of a run's tasks, keep each as soon as it is finished, and return them all.
 
     Raises:
-        ReportError: A folder holds a run with other settings, or something else.
+        ReportError: The folder holds a run with other settings, or something else.
         StorageError: A shard could not be written; the ones before it are kept.
         FgtutorError: What `run_tasks` raises.
     """
     done = finished(tasks, settings, config)
-    left = [task for task in part_of(tasks, config) if task.name not in done]
+    left = [task for task in tasks if task.name not in done]
     if config.out:
-        _open(config.out, settings)
-        for task in tasks:  # what came from elsewhere
-            if task.name in done and not _shard(config.out, task).exists():
-                _keep(config.out, task, done[task.name], settings)
+        make_folder(config.out / SHARDS)
+        if not (config.out / SETTINGS).exists():
+            write_json(config.out / SETTINGS, settings)
     with tqdm(total=len(left), unit="task", disable=not progress) as bar:
         for task, result in run_tasks(left, workers=config.workers, ray=config.ray):
             if config.out:
-                _keep(config.out, task, result, settings)
+                write_json(_shard(config.out, task), {"settings": settings, **asdict(result)})
             done[task.name] = result
             bar.update()
-    return Run(tasks=len(tasks), results=tuple(done[t.name] for t in tasks if t.name in done))
+    return Run([done[task.name] for task in tasks])
 
 
 def finished(
     tasks: Iterable[Task], settings: dict[str, Any], config: RunConfig
 ) -> dict[str, Result]:
-    """Return the results of the tasks that earlier runs, here or elsewhere, have finished.
+    """Return the results that the report folder holds, by the names of their tasks.
 
-    A shard that cannot be read counts as missing: its task is done again. Raises `ReportError` if a
-    folder belongs to a run with other settings.
+    A shard that cannot be read counts as missing: its task is done again. Raises `ReportError` if
+    the folder belongs to a run with other settings, or to something else.
     """
-    folders = [*config.merge, *([config.out] if config.out and config.out.exists() else [])]
-    for folder in folders:
-        _check(folder, settings, new=folder == config.out)
+    if config.out is None or not config.out.exists():
+        return {}
+    _check(config.out, settings)
     done = {}
-    for folder in folders:
-        for task in tasks:
-            try:
-                shard = read_record(_Shard, _shard(folder, task), ReportError)
-            except ReportError:
-                continue
-            if shard.settings != settings:
-                raise ReportError(
-                    f"{_shard(folder, task)} comes from a run with other settings: remove it"
-                )
-            done[task.name] = Result(rows=shard.rows, seconds=shard.seconds, machine=shard.machine)
+    for task in tasks:
+        path = _shard(config.out, task)
+        try:
+            shard = read_record(_Shard, path, ReportError)
+        except ReportError:
+            continue
+        if shard.settings != settings:
+            raise ReportError(f"{path} comes from a run with other settings: remove it")
+        done[task.name] = Result(rows=shard.rows, seconds=shard.seconds, machine=shard.machine)
     return done
-
-
-def part_of(tasks: Sequence[T], config: RunConfig) -> Sequence[T]:
-    """Take every n-th task: neighbours resemble each other in cost, so the parts do too."""
-    which, of = config.part
-    return tasks[which - 1 :: of]
 
 
 def _shard(folder: Path, task: Task) -> Path:
     return folder / SHARDS / f"{task.name}.json"
 
 
-def _keep(folder: Path, task: Task, result: Result, settings: dict[str, Any]) -> None:
-    write_json(_shard(folder, task), {"settings": settings, **asdict(result)})
-
-
-def _open(folder: Path, settings: dict[str, Any]) -> None:
-    make_folder(folder / SHARDS)
-    if not (folder / SETTINGS).exists():
-        write_json(folder / SETTINGS, settings)
-
-
-def _check(folder: Path, settings: dict[str, Any], *, new: bool) -> None:
-    """Raise `ReportError` unless the folder is this run's, or empty where a `new` one may begin."""
-    if new and folder.is_dir() and all(path.name == LOCK for path in folder.iterdir()):
+def _check(folder: Path, settings: dict[str, Any]) -> None:
+    """Raise `ReportError` unless the folder is this run's, or empty, so that one may begin in it."""
+    if folder.is_dir() and all(path.name == LOCK for path in folder.iterdir()):
         return
     try:
         theirs = read_record(dict[str, Any], folder / SETTINGS, ReportError)
@@ -201,11 +164,10 @@ def _check(folder: Path, settings: dict[str, Any], *, new: bool) -> None:
             f"{folder} is not a report folder ({error}): choose another one"
         ) from error
     if theirs != settings:
-        names = sorted(settings.keys() | theirs.keys())
         changes = (
             f"{name if name in settings else repr(name)[:40]} was {theirs.get(name)!r:.200} "
             f"and is {settings.get(name)!r:.200}"
-            for name in names
+            for name in sorted(settings.keys() | theirs.keys())
             if theirs.get(name) != settings.get(name)
         )
         raise ReportError(

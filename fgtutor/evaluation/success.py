@@ -16,7 +16,6 @@ import numpy as np
 from annotated_types import Interval
 
 from fgtutor.baselines import planners
-from fgtutor.errors import ReportError
 from fgtutor.evaluation import report
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.planned import PlannedConfig
@@ -26,7 +25,6 @@ from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.evaluation.trials import Ground, drive
 from fgtutor.figures.rates_svg import share_chart
 from fgtutor.io.storage import check_writable, write_json
-from fgtutor.io.validation import NonNegative
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.statistics import Share, wilson_interval
 from fgtutor.world.terrain import Terrain, make_terrain
@@ -54,9 +52,6 @@ class TrialsConfig(PlannedConfig):
     goal each (mixed: its own) and crosses each 250 times."""
     difficulty: Fraction = 1.0
     """Difficulty of all terrains."""
-    switch_cost: NonNegative = 0.0
-    """Extra cost of changing the policy, in the unit of `cost` (metres or steps where F is 1); 0 is
-    the paper's."""
     json: Path | None = None
     """Write the table's rows here."""
 
@@ -150,10 +145,7 @@ def run_task(
         [make_ground(config, terrain, index) for index in grounds],
         {name: known[name] for name in policies},
         zoo,
-        taus=config.taus,
-        f_min=config.f_min,
-        switch_cost=config.switch_cost,
-        cost=config.cost,
+        settings=config.planning,
     )
     return [asdict(trial) for trial in trials]
 
@@ -185,17 +177,12 @@ def by_cell(
 def evaluate(
     config: TrialsConfig, command: str, terrains: Sequence[str], policies: Sequence[str]
 ) -> list[Row]:
-    """Return a row for every terrain and policy; the same for any number of workers.
-
-    Raises `ReportError` if `config.part` leaves tasks to others.
-    """
+    """Return a row for every terrain and policy; the same for any number of workers."""
     run = collect(
         make_tasks(config, terrains, policies),
         _settings(config, command, terrains, policies),
         config,
     )
-    if not run.complete:
-        raise ReportError(f"{run}: give the other parts' folders to `merge` for the table")
     return _summaries(run.rows, terrains, policies)
 
 
@@ -232,8 +219,7 @@ def run_and_report(
             print(f"rows -> {config.json}")
         caption = (
             f"Success in % with 95 % intervals, {config.count:,} trials a cell; robot "
-            f"{config.robot}, protocol {config.protocol}, tau {config.taus}, cost {config.cost}, "
-            f"switch cost {config.switch_cost:g}, seed {config.seed}."
+            f"{config.robot}, protocol {config.protocol}, {config.planning}, seed {config.seed}."
         )
         chart = share_chart(_shares(rows), title)
         return Findings(

@@ -211,7 +211,7 @@ def _crossings(work: Training, specialist: Specialist, trials: int) -> list[Row]
     for indices in cut(trials):
         grounds = [make_ground(crossings, kinds[i % len(kinds)], i) for i in indices]
         planned = {specialist.name: partial(single, specialist.name)}
-        driven = drive(grounds, planned, {specialist.name: specialist}, cost=crossings.cost)
+        driven = drive(grounds, planned, {specialist.name: specialist}, settings=crossings.planning)
         rows += [known | asdict(trial) for trial in driven]
     return rows
 

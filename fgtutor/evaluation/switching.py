@@ -20,9 +20,9 @@ from typing import Annotated, TypeVar
 import numpy as np
 from annotated_types import Interval, MinLen
 
-from fgtutor.baselines import OURS, Planner, View, find_route, ours, single
+from fgtutor.baselines import OURS, AssessedMap, Planner, find_route, ours, single
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError, PlanningError, TerrainError
+from fgtutor.errors import ConfigError, TerrainError
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.planned import PlannedConfig
 from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
@@ -31,7 +31,7 @@ from fgtutor.evaluation.success import cut, terrain_seed
 from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.execution import FollowConfig, execute_batch
 from fgtutor.figures.rates_svg import share_chart
-from fgtutor.io.validation import Count, Positive, Unique, check_arguments
+from fgtutor.io.validation import Count, Unique, check_arguments
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.robots import ROBOTS
 from fgtutor.robots.lidar import scan_terrain, survey
@@ -70,11 +70,6 @@ class SwitchingConfig(PlannedConfig):
     """Only these courses, such as steps-gaps; default: every pair of neighbours, and full."""
     planners: Annotated[tuple[str, ...], Unique] = ()
     """Only these planners; default: all."""
-    switch_cost: Positive = 1.0
-    """Cost of a change of policy for the planners that heed it, in the unit of `cost` (metres or
-    steps where F is 1)."""
-    hold_steps: Annotated[int, Interval(ge=1, le=100_000)] = FollowConfig.hold_steps
-    """Control steps for which another policy must be wanted, for the planners with hysteresis."""
     difficulty: Fraction = 1.0
     """Difficulty of all terrains."""
     scan_spacing: Annotated[float, Interval(ge=0.01, le=100)] = 0.2
@@ -99,7 +94,7 @@ def variants(config: SwitchingConfig, zoo: Mapping[str, Specialist]) -> dict[str
     The switch cost includes that both policies must be able to take the step, since the search
     does. Raises `ConfigError` for a name that is none of them.
     """
-    cost, hold = config.switch_cost, config.hold_steps
+    cost, hold = config.planning.switch_cost, config.planning.hold_steps
     known = {
         OURS: Variant(planner=ours),
         "+ hysteresis": Variant(planner=ours, hold_steps=hold),
@@ -202,8 +197,12 @@ def run_task(config: SwitchingConfig, course: str, indices: Sequence[int]) -> li
         )
         for index in indices
     ]
-    views = [
-        View(scan_map(ground, seed=ground.seed, spacing=config.scan_spacing), zoo, config.taus)
+    maps = [
+        AssessedMap(
+            scan_map(ground, seed=ground.seed, spacing=config.scan_spacing),
+            zoo,
+            config.planning.taus,
+        )
         for ground in grounds
     ]
     routes: dict[tuple[Planner, float], list[Route | None]] = {}
@@ -212,8 +211,8 @@ def run_task(config: SwitchingConfig, course: str, indices: Sequence[int]) -> li
         how = variant.planner, variant.switch_cost
         if how not in routes:
             routes[how] = [
-                _route(ground, view, variant, config)
-                for ground, view in zip(grounds, views, strict=True)
+                _route(ground, known, variant, config)
+                for ground, known in zip(grounds, maps, strict=True)
             ]
         for level in config.levels:
             shared = {"course": course, "policy": name, "noise": level[0], "drift": level[1]}
@@ -224,19 +223,12 @@ def run_task(config: SwitchingConfig, course: str, indices: Sequence[int]) -> li
     return rows
 
 
-def _route(ground: Terrain, view: View, variant: Variant, config: SwitchingConfig) -> Route | None:
-    try:
-        return find_route(
-            variant.planner,
-            view,
-            ground.start,
-            ground.goal,
-            f_min=config.f_min,
-            switch_cost=variant.switch_cost,
-            cost=config.cost,
-        )
-    except PlanningError:
-        return None
+def _route(
+    ground: Terrain, known: AssessedMap, variant: Variant, config: SwitchingConfig
+) -> Route | None:
+    settings = replace(config.planning, switch_cost=variant.switch_cost)
+    answer = find_route(variant.planner, known, ground.start, ground.goal, settings)
+    return answer if isinstance(answer, Route) else None
 
 
 def _drive(
@@ -337,9 +329,7 @@ def run(config: SwitchingConfig) -> int:
             caption=(
                 f"Success in % with 95 % intervals, {config.trials:,} trials a cell; fixes with a "
                 "standard deviation of noise (cm) and a drift (cm per root second), maps from a "
-                f"simulated scan; robot {config.robot}, tau {config.taus}, cost {config.cost}, "
-                f"f_min {config.f_min:g}, switch cost {config.switch_cost:g}, hysteresis of "
-                f"{config.hold_steps} steps, seed {config.seed}."
+                f"simulated scan; robot {config.robot}, {config.planning}, seed {config.seed}."
             ),
             figures=charts(trials),
         )

@@ -8,13 +8,12 @@ Source: paper, Sec. IV-B: a trial fails if no route is found or the goal is not 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from fgtutor.baselines import Planner, View, find_route
+from fgtutor.baselines import AssessedMap, Planner, find_route
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import PlanningError
 from fgtutor.execution import FollowConfig, execute_batch
-from fgtutor.planning import Cost, Route
+from fgtutor.routes import Refusal, Route
+from fgtutor.settings import PlanSettings
 from fgtutor.specialist import Specialist
-from fgtutor.tensorization import Taus
 from fgtutor.world.terrain import Terrain
 
 EPISODES = 50
@@ -59,37 +58,28 @@ def drive(
     planned: Mapping[str, Planner],
     zoo: Mapping[str, Specialist],
     *,
-    taus: Taus = "calibrated",
-    f_min: float = 0.1,
-    switch_cost: float = 0.0,
-    cost: Cost = "inverse",
-    follow: FollowConfig | None = None,
+    settings: PlanSettings,
 ) -> list[Trial]:
     """Plan over every ground with every planner, and drive the routes; planner by planner.
 
     Each (ground, specialist) is assessed once, each (ground, planner) planned once.
     """
-    views = [View(ground.seen or ground.terrain.elevation, zoo, taus) for ground in grounds]
+    maps = [
+        AssessedMap(ground.seen or ground.terrain.elevation, zoo, settings.taus)
+        for ground in grounds
+    ]
+    follow = FollowConfig(hold_steps=settings.hold_steps)
     trials: list[Trial] = []
     for name, planner in planned.items():
         jobs: dict[tuple[str, ...], list[tuple[Route, Terrain, int]]] = {}
-        for ground, view in zip(grounds, views, strict=True):
+        for ground, known in zip(grounds, maps, strict=True):
             terrain = ground.terrain
-            try:
-                route = find_route(
-                    planner,
-                    view,
-                    terrain.start,
-                    terrain.goal,
-                    f_min=f_min,
-                    switch_cost=switch_cost,
-                    cost=cost,
-                )
-            except PlanningError:
+            route = find_route(planner, known, terrain.start, terrain.goal, settings)
+            if isinstance(route, Refusal):
                 trials += (_trial(terrain, name, seed, "no_route") for seed in ground.seeds)
-            else:
-                work = jobs.setdefault(route.names, [])
-                work += ((route, terrain, seed) for seed in ground.seeds)
+                continue
+            work = jobs.setdefault(route.names, [])
+            work += ((route, terrain, seed) for seed in ground.seeds)
         for work in jobs.values():
             trials += _episodes(name, work, zoo, follow)
     return trials
@@ -99,7 +89,7 @@ def _episodes(
     name: str,
     work: Sequence[tuple[Route, Terrain, int]],
     zoo: Mapping[str, Specialist],
-    follow: FollowConfig | None,
+    follow: FollowConfig,
 ) -> Iterator[Trial]:
     """Drive routes, `EPISODES` at a time."""
     for first in range(0, len(work), EPISODES):

@@ -31,7 +31,7 @@ from fgtutor.figures.canvas import POLICY_COLOURS, TITLE, Picture, policy_colour
 from fgtutor.io.validation import Count, check_arguments
 
 if TYPE_CHECKING:
-    from fgtutor.pipeline import Plan
+    from fgtutor.planning import Plan
     from fgtutor.routes import Route
 
 __all__ = [

@@ -1,0 +1,82 @@
+"""How to plan: the thresholds, the cost of a step and of a switch, and the hysteresis of the drive.
+
+Gives `PlanSettings()`, which are ours, and `PAPER`, the paper's: every command, table, notebook and
+widget starts from one of the two. Source: paper, Secs. III-B, III-C and IV-B.
+"""
+
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Literal
+
+from annotated_types import Interval
+
+from fgtutor.io.validation import Count, NonNegative, Positive, check_fields
+
+Taus = Literal["paper", "calibrated"] | tuple[float, float]
+Unknown = Literal["block", "fill"]
+Backend = Literal["auto", "networkx", "scipy"]
+Cost = Literal["inverse", "length"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanSettings:
+    """How to plan. The defaults are ours, by which every table is made; `PAPER` is the paper's."""
+
+    taus: Taus = "calibrated"
+    """Thresholds of w_ood: "calibrated" (each specialist's own), "paper", or a pair for all."""
+    cost: Cost = "length"
+    """Cost of a step: "inverse" is 1 / F (the paper, by which a diagonal step costs no more than a
+    straight one and routes zigzag), "length" is that times the step's metres."""
+    f_min: Positive = 0.1
+    """Steps with a lower F do not exist; above 0."""
+    switch_cost: NonNegative = 1.0
+    """Cost of changing the policy, in the unit of `cost`; above 0 the policy changes only for a
+    step that the old and the new policy can both take. At 0 policies of equal F take turns."""
+    hold_steps: Count = 3
+    """Hysteresis on the drive: a policy takes over once it has been wanted for this many control
+    steps; 1 is none."""
+    unknown: Unknown = "block"
+    """What to do with unknown cells: "block" closes them, "fill" trusts the filled heights."""
+    backend: Backend = "auto"
+    """Which library searches, "networkx" or "scipy"; both find the same cost. "auto" is scipy,
+    which won at every size measured (benchmarks/bench_plan.py)."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def __str__(self) -> str:
+        taus = self.taus if isinstance(self.taus, str) else "{:g} to {:g}".format(*self.taus)
+        return (
+            f"tau {taus}, f_min {self.f_min:g}, cost {self.cost}, switch cost "
+            f"{self.switch_cost:g}, hysteresis of {self.hold_steps} steps"
+        )
+
+
+PAPER = PlanSettings(taus="paper", cost="inverse", switch_cost=0.0, hold_steps=1)
+"""The paper's own: tau 0.1 and 2.0, cost 1 / F, free switching, no hysteresis."""
+SETTINGS = {"ours": PlanSettings(), "paper": PAPER}
+"""The two settings that have a name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions:
+    """`PlanSettings` as options of a command: one of the two by name, and single ones changed."""
+
+    settings: Literal["ours", "paper"] = "ours"
+    """How to plan: our settings, or the paper's. The options below change one thing each."""
+    taus: Literal["paper", "calibrated"] | None = None
+    """Thresholds of w_ood: the paper's 0.1 and 2.0, or each specialist's own."""
+    cost: Cost | None = None
+    """Cost of a step: 1 / F (inverse, the paper's), or that times the step's metres."""
+    f_min: Annotated[float, Interval(gt=0, le=1)] | None = None
+    """Steps less feasible than this do not exist (0.1 in both)."""
+    switch_cost: NonNegative | None = None
+    """Cost of changing the policy (ours 1, the paper's 0)."""
+    hold_steps: Count | None = None
+    """Control steps for which a policy is wanted before it takes over (ours 3, the paper's 1)."""
+
+    @property
+    def planning(self) -> PlanSettings:
+        """The settings that these options choose."""
+        single = {one.name: getattr(self, one.name) for one in fields(PlanOptions)}
+        chosen = SETTINGS[single.pop("settings")]
+        return replace(chosen, **{name: v for name, v in single.items() if v is not None})
