@@ -18,7 +18,13 @@ from scipy import ndimage
 from fgtutor.errors import MapError, OffMapError
 from fgtutor.grid import cells_of, check_cells, coordinate_text, point_text
 from fgtutor.io import maps
-from fgtutor.io.validation import NonNegative, check_arguments, check_fields
+from fgtutor.io.validation import (
+    NonNegative,
+    check_arguments,
+    check_fields,
+    detached,
+    numbers,
+)
 
 Resolution = Annotated[float, Interval(ge=1e-3, le=1e6)]
 """Side of a cell, m. Less than a millimetre is no metre: degrees, in all likelihood."""
@@ -73,12 +79,8 @@ class ElevationMap:
         if not known.any():
             raise MapError("every cell of the map is unknown (NaN): nothing can be planned on it")
         heights.flags.writeable = known.flags.writeable = False
-        for name, value in {
-            "heights": heights,
-            "resolution": resolution,
-            "origin": origin,
-            "known": known,
-        }.items():
+        values = {"heights": heights, "resolution": resolution, "origin": origin, "known": known}
+        for name, value in values.items():
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
@@ -132,10 +134,8 @@ class ElevationMap:
 
     def centre_of(self, ix: int, iy: int) -> tuple[float, float]:
         """Return the centre (x, y) of a cell, m; the cell need not be on the map."""
-        return (
-            self.origin[0] + (ix + 0.5) * self.resolution,
-            self.origin[1] + (iy + 0.5) * self.resolution,
-        )
+        (x0, y0), step = self.origin, self.resolution
+        return x0 + (ix + 0.5) * step, y0 + (iy + 0.5) * step
 
     def contains(self, x: float, y: float) -> bool:
         """Return whether a point lies on the map, its border included."""
@@ -157,8 +157,9 @@ class ElevationMap:
         """
         (nx, ny), (x0, y0) = self.shape, self.origin
         with np.errstate(over="ignore"):
-            u = np.clip((as_numbers(x, "x") - x0) / self.resolution - 0.5, 0, nx - 1)
-            v = np.clip((as_numbers(y, "y") - y0) / self.resolution - 0.5, 0, ny - 1)
+            x, y = (numbers(n, p, MapError, unknown=True) for n, p in (("x", x), ("y", y)))
+            u = np.clip((x - x0) / self.resolution - 0.5, 0, nx - 1)
+            v = np.clip((y - y0) / self.resolution - 0.5, 0, ny - 1)
         nowhere = np.isnan(u) | np.isnan(v)
         u, v = np.nan_to_num(u), np.nan_to_num(v)
         i = np.minimum(u.astype(int), nx - 2)
@@ -262,32 +263,6 @@ class ElevationMap:
             origin=(corner_x - half, corner_y - half),
         )
 
-    def resample(self, resolution: Resolution) -> Self:
-        """Return the map on cells of another size: bilinear heights, the origin kept.
-
-        A new cell is known, and has a height, where the old cell at its centre was known. The area
-        shrinks or grows by less than half a new cell where its size is no multiple of theirs.
-
-        Raises:
-            MapError: The resolution is no positive length, or leaves too few or too many cells.
-        """
-        check_arguments(ElevationMap.resample, locals(), MapError)
-        check_cells([round(length / resolution) for length in self.size])
-        steps = [
-            (np.arange(max(round(length / resolution), 1)) + 0.5) * resolution
-            for length in self.size
-        ]
-        ix, iy = (
-            np.minimum(cells_of(step, 0.0, self.resolution), n - 1)
-            for step, n in zip(steps, self.shape, strict=True)
-        )
-        known = self.known[np.ix_(ix, iy)]
-        x, y = self.origin[0] + steps[0], self.origin[1] + steps[1]
-        heights = self.filled().height_at(x[:, None], y[None, :])
-        kept = known | ~np.isnan(self.heights[np.ix_(ix, iy)])
-        heights = np.where(kept, heights, np.nan)
-        return type(self)(heights, resolution=resolution, origin=self.origin, known=known)
-
     def rotated90(self, k: int = 1) -> Self:
         """Return the map turned by k quarter turns counter-clockwise about the world's (0, 0).
 
@@ -341,33 +316,9 @@ class ElevationMap:
             raise MapError(f"{path}: {error}") from error
 
 
-def as_numbers(values: Any, name: str) -> np.ndarray:
-    """Return real numbers as an array of floats, without a gradient; masked ones are NaN.
-
-    Raises:
-        MapError: They are not real numbers, or form no array.
-    """
-    try:
-        with np.errstate(all="ignore"):
-            # A list of masked rows keeps its masks only so.
-            numbers: Any = np.ma.asarray(_detached(values))
-    except Exception as error:  # whatever a foreign type raises
-        raise MapError(f"{name} must be a grid of numbers: {error}") from error
-    if numbers.dtype.kind not in "fiu":
-        raise MapError(f"{name} must be a grid of numbers that are real, got {numbers.dtype}")
-    if numbers.dtype.kind != "f":
-        numbers = numbers.astype(np.float64)
-    return numbers.filled(np.nan)
-
-
-def _detached(values: Any) -> Any:
-    """Return a tensor without its gradient, anything else as it is."""
-    return values.detach().cpu() if hasattr(values, "detach") else values
-
-
 def _as_truths(values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return which cells are known, as a copy; masked ones are not."""
-    known: Any = np.ma.asarray(_detached(values))
+    known: Any = np.ma.asarray(detached(values))
     if known.dtype.kind != "b":
         raise MapError(f"known must hold True or False for each cell, got {known.dtype}")
     if known.shape != shape:
@@ -377,16 +328,16 @@ def _as_truths(values: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 def _as_heights(values: Any) -> np.ndarray:
     """Return a float32 copy of the heights, or say what is wrong with them."""
-    numbers = as_numbers(values, "heights")
-    if numbers.ndim != 2 or min(numbers.shape) < 2:
-        raise MapError(f"a map needs at least 2 x 2 cells [nx, ny], got shape {numbers.shape}")
-    low, high = np.fmin.reduce(numbers, axis=None), np.fmax.reduce(numbers, axis=None)
-    if low < -_HIGHEST or high > _HIGHEST or (numbers == _NO_HEIGHT).any():
-        wrong = (np.abs(numbers) > _HIGHEST) | (numbers == _NO_HEIGHT)
+    heights = numbers("heights", values, MapError, unknown=True)
+    if heights.ndim != 2 or min(heights.shape) < 2:
+        raise MapError(f"a map needs at least 2 x 2 cells [nx, ny], got shape {heights.shape}")
+    low, high = np.fmin.reduce(heights, axis=None), np.fmax.reduce(heights, axis=None)
+    if low < -_HIGHEST or high > _HIGHEST or (heights == _NO_HEIGHT).any():
+        wrong = (np.abs(heights) > _HIGHEST) | (heights == _NO_HEIGHT)
         ix, iy = np.argwhere(wrong)[0]
         raise MapError(
-            f"cell ({ix}, {iy}) has a height of {numbers[ix, iy]:g} m ({wrong.sum()} such cells): "
+            f"cell ({ix}, {iy}) has a height of {heights[ix, iy]:g} m ({wrong.sum()} such cells): "
             "if it stands for no data, declare it in the file or mark unknown cells with NaN; else "
             "check the unit"
         )
-    return np.array(numbers, dtype=np.float32)
+    return np.array(heights, dtype=np.float32)

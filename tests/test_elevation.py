@@ -212,7 +212,7 @@ def test_height_at_is_nan_where_the_point_is() -> None:
     np.testing.assert_array_equal(elevation.height_at(masked, 0.5), [0.0, math.nan])
     assert elevation.height_at(torch.tensor([0.5], requires_grad=True), 0.5).tolist() == [0.0]
     for wrong in ("1", None, 1j, [[1], [2, 3]]):
-        with pytest.raises(MapError, match="x must be a grid of numbers"):
+        with pytest.raises(MapError, match=r"x (is no array of numbers|holds)"):
             elevation.height_at(wrong, 0.5)
 
 
@@ -307,24 +307,6 @@ def test_crop_keeps_cells_where_they_were() -> None:
         elevation.crop(1.8, -2.2, 2.2, 99.0)
 
 
-def test_resample_by_hand() -> None:
-    fine = ElevationMap([[0.0, 0.0], [4.0, 4.0]], resolution=1.0).resample(0.5)
-    assert fine.heights[:, 0].tolist() == [0.0, 1.0, 3.0, 4.0]
-    assert fine.shape == (4, 4)
-    coarse = ElevationMap(np.arange(16.0).reshape(4, 4), resolution=0.5).resample(1.0)
-    assert coarse.heights.tolist() == [[2.5, 4.5], [10.5, 12.5]]  # means of 2 x 2 cells
-
-
-def test_resample_keeps_unknown_cells_unknown() -> None:
-    elevation = hilly(resolution=0.2)
-    fine = elevation.resample(0.1)
-    np.testing.assert_array_equal(fine.known, np.kron(elevation.known, np.ones((2, 2), bool)))
-    np.testing.assert_array_equal(np.isnan(fine.heights), ~fine.known)
-    assert np.isfinite(elevation.filled().resample(0.1).heights).all()
-    with pytest.raises(MapError, match="resolution"):
-        elevation.resample(-1.0)
-
-
 def test_crop_keeps_the_cells_on_its_border_at_any_origin() -> None:
     elevation = ElevationMap(np.zeros((200, 200)), 0.1, (500000.35, 5648298.15))
     for n in range(100):
@@ -340,26 +322,18 @@ def test_crop_keeps_the_cells_on_its_border_at_any_origin() -> None:
 @pytest.mark.parametrize(
     "call",
     [
-        lambda elevation, number: elevation.resample(number),
         lambda elevation, number: elevation.smoothed(number),
         lambda elevation, number: elevation.levelled(0.5, number),
         lambda elevation, number: elevation.crop(0, 0, 1, math.nan),
         lambda elevation, number: elevation.rotated90(1.0 if number == -1.0 else number),
     ],
-    ids=["resample", "smoothed", "levelled", "crop", "rotated90"],
+    ids=["smoothed", "levelled", "crop", "rotated90"],
 )
 def test_numbers_that_make_no_sense_are_refused(call, number) -> None:
     with pytest.raises(MapError):
         call(ElevationMap(np.zeros((20, 20))), number)
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda elevation: elevation.resample(0.001),
-        lambda elevation: elevation.levelled(0.5, 1000.0),
-    ],
-)
-def test_maps_too_large_are_refused_before_memory_is_taken(call) -> None:
+def test_maps_too_large_are_refused_before_memory_is_taken() -> None:
     with pytest.raises(MapError, match=f"more than {MOST_CELLS}"):
-        call(ElevationMap(np.zeros((100, 100))))
+        ElevationMap(np.zeros((100, 100))).levelled(0.5, 1000.0)

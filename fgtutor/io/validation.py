@@ -106,23 +106,34 @@ def _check(kind: Callable[..., Any], values: Mapping[str, Any], error: type[Fgtu
             raise error(f"{name}: {_first(problem)}") from None
 
 
-def numbers(name: str, values: Any, error: type[FgtutorError]) -> np.ndarray:
-    """Return an array, tensor or nested list as a numpy array, if it holds finite numbers only.
+def numbers(
+    name: str, values: Any, error: type[FgtutorError], *, unknown: bool = False
+) -> np.ndarray:
+    """Return an array, tensor or nested list of real numbers as a numpy array.
 
-    A tensor is taken from its device and its gradient. Raises `error`, which says `name`.
+    They must be finite, unless some may be unknown: then NaN is allowed, masked values become NaN,
+    and whole numbers floats. Raises `error`, which says `name`.
     """
-    given = values.detach().cpu() if hasattr(values, "detach") else values
     try:
-        array = np.asarray(given)
-    except (TypeError, ValueError) as problem:
+        with np.errstate(all="ignore"):
+            # A list of masked rows keeps its masks only so.
+            array: Any = np.ma.asarray(detached(values))
+    except Exception as problem:  # whatever a foreign type raises
         raise error(f"{name} is no array of numbers: {problem}") from None
-    if array.dtype.kind not in "fiub":
+    if array.dtype.kind not in ("fiu" if unknown else "fiub"):
         raise error(f"{name} holds {array.dtype}, expected real numbers")
-    if np.ma.is_masked(given):
+    if unknown:
+        return (array if array.dtype.kind == "f" else array.astype(np.float64)).filled(np.nan)
+    if np.ma.is_masked(array):
         raise error(f"{name} has masked values: give each a number first (numpy.ma.filled)")
-    if not np.isfinite(array).all():
+    if not np.isfinite(array.data).all():
         raise error(f"{name} holds NaN or infinity: check the Feasibility-Nets that it came from")
-    return array
+    return array.data
+
+
+def detached(values: Any) -> Any:
+    """Return a tensor without its device and its gradient, anything else as it is."""
+    return values.detach().cpu() if hasattr(values, "detach") else values
 
 
 def parse_options(kind: type[T], words: Sequence[str], program: str, default: T | None = None) -> T:
