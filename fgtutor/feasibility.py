@@ -123,6 +123,7 @@ class FeasibilityNet(nn.Module):
         patch: Float[Tensor, "batch points"],
         command: Float[Tensor, "batch command"],
         r_v: Float[Tensor, "batch"],
+        *,
         alpha: float = 1.0,
         beta: float = 5e-4,
         generator: torch.Generator | None = None,

@@ -37,7 +37,6 @@ TINY = {
     "label_seconds": 0.12,
     "save_every": 2,
     "iterations": 4,
-    "context_batch": 64,
 }
 
 
@@ -338,7 +337,8 @@ def test_training_gives_a_blind_specialist_with_a_critic_that_sees(tmp_path):
 
 
 def test_the_ppo_loss_never_reaches_the_encoder(tmp_path):
-    trainer = Trainer(tiny(tmp_path, context_updates=0))
+    trainer = Trainer(tiny(tmp_path))
+    trainer.algorithm.context_updates = 0
     policy = trainer.algorithm.get_policy()
     before = {k: v.clone() for k, v in policy.state_dict().items()}
     trainer.iterate()
@@ -355,9 +355,10 @@ def test_the_ppo_loss_never_reaches_the_encoder(tmp_path):
 
 @robots
 def test_the_encoder_learns_from_a_rollout(robot, tmp_path):
-    trainer = Trainer(tiny(tmp_path, robot, num_envs=8, context_updates=0))
-    trainer.iterate()
+    trainer = Trainer(tiny(tmp_path, robot, num_envs=8))
     algorithm = trainer.algorithm
+    algorithm.context_updates, algorithm.context_batch = 0, 64
+    trainer.iterate()
     context = algorithm.context
     samples = context.samples(algorithm.storage.observations)
     assert len(samples[0]) > 40

@@ -13,8 +13,8 @@ from fgtutor.baselines import OccupancyConfig, TraversabilityConfig
 from fgtutor.errors import ConfigError, TerrainError
 from fgtutor.execution import FollowConfig
 from fgtutor.robots.a1.model import A1Config
-from fgtutor.robots.a1.observation import RewardWeights
 from fgtutor.robots.a1.randomise import A1EnvConfig
+from fgtutor.robots.a1.rewards import RewardWeights
 from fgtutor.robots.crossings import EnvConfig
 from fgtutor.robots.lidar import LidarConfig
 from fgtutor.robots.toy import ToyModel
@@ -36,7 +36,7 @@ SENSE = {
     **dict.fromkeys(("start", "goal", "area"), ZERO + BELOW + HUGE),
     **dict.fromkeys(("hours", "outlier_ratio", "relief", "switch_cost"), ZERO + HUGE),
     "clearance": (*HUGE, math.inf),
-    **dict.fromkeys(("context_updates", "critic_warmup", "difficulty"), ZERO),
+    **dict.fromkeys(("critic_warmup", "difficulty"), ZERO),
     **dict.fromkeys(("easiest", "easiest_at_last", "entropy", "f_min", "gamma", "heights"), ZERO),
     **dict.fromkeys(("label_seconds", "levels", "neighbours", "seed"), ZERO),
     **dict.fromkeys(("seeds", "workers"), ZERO),

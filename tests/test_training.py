@@ -369,7 +369,6 @@ def test_ctrl_c_saves_and_returns_what_was_learned(tmp_path):
         ({"initial_std": -1.0}, "initial_std: should be greater than 0"),
         ({"hidden": ()}, "hidden: .* at least 1 item"),
         ({"hidden": (8, 0)}, "hidden: 1: should be greater than or equal to 1"),
-        ({"feasibility_batch": 0}, "feasibility_batch: "),
         ({"label_seconds": float("inf")}, "label_seconds: should be a finite number"),
         ({"planning_speed": 0.0}, "planning_speed: should be greater than 0"),
         ({"threads": 100_000}, "threads: should be less than or equal to 256"),

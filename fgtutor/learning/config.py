@@ -1,4 +1,4 @@
-"""The recipe of a training: its settings, the world it happens in, and rsl_rl's configuration.
+"""Settings of a training, the terrain it happens on, and rsl_rl's configuration.
 
 Reads a `TrainConfig`, which the command line fills; gives robots on terrain and what rsl_rl needs.
 Source: paper, Sec. IV (specialists, DreamWaQ's protocol); PPO's sizes were found by experiment.
@@ -21,16 +21,14 @@ from fgtutor.io.validation import Count, CountOrZero, NonNegative, Seed, Share, 
 from fgtutor.learning.ppo import FeasibilityPPO
 from fgtutor.policies.dreamwaq import HISTORY, DreamWaQModel
 from fgtutor.policies.symmetry import SymmetricMLPModel
-from fgtutor.robots import ROBOTS, env_class
+from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.world.terrain import World, make_terrain
+from fgtutor.world.terrain import SCALES, World, make_terrain
 
 Robots = Annotated[int, Interval(ge=1, le=100_000)]
 """Robots, or steps of one: as many as memory may hold."""
 Side = Annotated[int, Interval(ge=1, le=1000)]
 """Terrains along one side of a world."""
-Batch = Annotated[int, Interval(ge=1, le=10**6)]
-"""Samples of one update."""
 Widths = Annotated[tuple[Annotated[int, Interval(ge=1, le=4096)], ...], MinLen(1)]
 """Widths of a network's hidden layers, at least one."""
 Seconds = Annotated[float, Interval(ge=0, le=60)]
@@ -93,7 +91,7 @@ class TrainConfig:
     default, or if it lies below `easiest`: it stays."""
     std_at_last: Std | None = None
     """Standard deviation of the action noise that is not exceeded when the first row has risen so
-    far; before, in proportion. On a narrow beam nobody learns who is shaken off it."""
+    far; before, in proportion. A robot that its noise shakes off a narrow beam learns nothing."""
     neighbours: Share = 0.0
     """Share of terrains with other obstacles at both ends, a landing away, as on mixed terrain; for
     a kind that mixed terrain has."""
@@ -115,16 +113,6 @@ class TrainConfig:
     """First iterations of such a run in which only the critic learns, since it is new."""
     feasibility_learning_rate: Rate = 2e-3
     """Adam learning rate of the Feasibility-Net; it falls to a twentieth over the run."""
-    feasibility_batch: Batch = 512
-    """Patches per Feasibility-Net update."""
-    feasibility_updates: Side = 24
-    """Feasibility-Net updates per iteration, on patches of all rollouts since the checkpoint."""
-    context_learning_rate: Rate = 1e-3
-    """Adam learning rate of a blind policy's context encoder."""
-    context_batch: Batch = 2048
-    """Steps per update of the context encoder."""
-    context_updates: Annotated[int, Interval(ge=0, le=1000)] = 16
-    """Updates of the context encoder per iteration."""
     threads: Threads = 1
     """Torch threads; two trainings side by side with one thread each beat one with two."""
     device: str = "cpu"
@@ -205,7 +193,7 @@ def training_world(config: TrainConfig, iteration: int = 0) -> World:
     `general` takes the robot's specialties in turn, column by column. Seeds are even here, and odd
     wherever terrain is evaluated, so nothing is ever evaluated on terrain trained on.
     """
-    mixed = ROBOTS[config.robot].scale.mixed
+    mixed = SCALES[config.robot].mixed
     names = mixed if config.terrain == "general" else (config.terrain,)
     levels = np.linspace(config.easiest, 1.0, config.rows) if config.rows > 1 else np.ones(1)
     rng = np.random.default_rng((config.seed, iteration))
@@ -235,8 +223,7 @@ def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
         training_world(config, iteration),
         config.num_envs,
         config=dataclasses.replace(
-            make.episodes,
-            history=HISTORY if config.actor == "dreamwaq" else 0,
+            make.episodes, history=HISTORY if config.actor == "dreamwaq" else 0
         ),
         seed=config.seed,
         device=config.device,
@@ -278,11 +265,5 @@ def runner_config(config: TrainConfig, env: LocomotionEnv) -> dict[str, Any]:
             "learning_rate": config.learning_rate,
             "desired_kl": 0.012,
             "label_steps": round(config.label_seconds / env.control_dt),
-            "feasibility_learning_rate": config.feasibility_learning_rate,
-            "feasibility_batch": config.feasibility_batch,
-            "feasibility_updates": config.feasibility_updates,
-            "context_learning_rate": config.context_learning_rate,
-            "context_batch": config.context_batch,
-            "context_updates": config.context_updates,
         },
     }

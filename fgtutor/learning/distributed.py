@@ -7,7 +7,6 @@ Source: rsl_rl's `OnPolicyRunner`, whose own way this is, except that it insists
 """
 
 import contextlib
-import io
 import os
 from collections.abc import Iterator
 from typing import Any, TypeVar
@@ -77,7 +76,7 @@ def mean(row: dict[str, float]) -> dict[str, float]:
 
 
 class Runner(OnPolicyRunner):
-    """rsl_rl's runner, whose processes may also do without GPUs: gloo joins them, not NCCL."""
+    """rsl_rl's runner, also for processes without GPUs, which gloo joins instead of NCCL."""
 
     def _configure_multi_gpu(self) -> None:
         if processes() == 1 or self.device != "cpu":
@@ -92,11 +91,6 @@ class Runner(OnPolicyRunner):
             "world_size": self.gpu_world_size,
         }
         torch.distributed.init_process_group("gloo")
-
-    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
-        """Learn as rsl_rl does, which says at every call that it synchronises its processes."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            super().learn(num_learning_iterations, init_at_random_ep_len)
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""PPO that fits the Feasibility-Net on the way: one rollout, two losses, no shared weight.
+"""PPO that fits the Feasibility-Net to the same rollouts: two losses, no shared weight.
 
 Reads rsl_rl's rollout storage, whose `tracking` group tells what happened after every step; gives
 an algorithm that trains policy and Feasibility-Net side by side, and the context encoder of a blind
@@ -6,6 +6,7 @@ policy.
 Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -27,34 +28,23 @@ class FeasibilityPPO(PPO):
     context encoder is fitted in the same way, to its own loss.
     """
 
-    def __init__(
-        self,
-        *args: Any,
-        label_steps: int,
-        feasibility_learning_rate: float,
-        feasibility_batch: int,
-        feasibility_updates: int,
-        context_learning_rate: float,
-        context_batch: int,
-        context_updates: int,
-        **kwargs: Any,
-    ) -> None:
+    feasibility_updates, feasibility_batch = 24, 512
+    """Updates of the Feasibility-Net per rollout, and patches per update."""
+    context_updates, context_batch = 16, 2048
+    """Updates of the context encoder per rollout, and steps per update."""
+
+    def __init__(self, *args: Any, label_steps: int, **kwargs: Any) -> None:
         """Add a Feasibility-Net sized by the `patch` group to what PPO builds."""
         super().__init__(*args, **kwargs)
+        self.label_steps = label_steps
         num_points = self.storage.observations["patch"].shape[-1]
         self.feasibility = FeasibilityNet(num_points).to(self.device)
-        self.feasibility_optimizer = torch.optim.Adam(
-            self.feasibility.parameters(), lr=feasibility_learning_rate
-        )
-        self.label_steps = label_steps
-        self.feasibility_batch, self.feasibility_updates = feasibility_batch, feasibility_updates
+        # The trainer sets its learning rate anew in each iteration.
+        self.feasibility_optimizer = torch.optim.Adam(self.feasibility.parameters())
         policy = self.get_policy()
         self.context = policy.context if isinstance(policy, DreamWaQModel) else None
         if self.context:
-            self.context_optimizer = torch.optim.Adam(
-                self.context.parameters(), lr=context_learning_rate
-            )
-        self.context_batch, self.context_updates = context_batch, context_updates
+            self.context_optimizer = torch.optim.Adam(self.context.parameters(), lr=1e-3)
         self.metrics: dict[str, float] = {}
         self.memory: list[tuple[Tensor, Tensor, Tensor]] = []
 
@@ -77,18 +67,11 @@ class FeasibilityPPO(PPO):
             self.metrics |= self.fit_context(self.context, *samples)
         return self.metrics
 
-    def fit_context(
-        self, context: ContextNet, history: Tensor, velocity: Tensor, following: Tensor
-    ) -> dict[str, float]:
+    def fit_context(self, context: ContextNet, *samples: Tensor) -> dict[str, float]:
         """Fit the context encoder to the samples of one rollout; return the mean loss parts."""
-        sums: dict[str, float] = {}
-        shape = (self.context_updates, self.context_batch)
-        for batch in torch.randint(len(history), shape, device=history.device):
-            loss, parts = context.loss(history[batch], velocity[batch], following[batch])
-            self._descend(loss, context, self.context_optimizer)
-            for name, value in parts.items():
-                sums[name] = sums.get(name, 0.0) + value.item() / self.context_updates
-        return {f"context_{name}": value for name, value in sums.items()}
+        draws = self._draw(samples, self.context_updates, self.context_batch)
+        losses = self._fit(context, self.context_optimizer, samples, draws)
+        return {f"context_{name}": value for name, value in losses.items()}
 
     def fit_feasibility(self) -> dict[str, float]:
         """Fit the net to the labelled patches at hand; return the mean of each loss part.
@@ -101,22 +84,37 @@ class FeasibilityPPO(PPO):
         self.memory.append(
             (observations["patch"][valid], observations["command"][valid], label[valid])
         )
-        patch, command, label = (torch.cat(parts) for parts in zip(*self.memory, strict=True))
-        sums: dict[str, float] = {}
-        shape = (self.feasibility_updates, self.feasibility_batch)
-        batches = torch.randint(len(label), shape, device=label.device)
-        for batch in batches:
-            loss, parts = self.feasibility.loss(patch[batch], command[batch], label[batch])
-            self._descend(loss, self.feasibility, self.feasibility_optimizer)
-            for name, value in parts.items():
-                sums[name] = sums.get(name, 0.0) + value.item() / len(batches)
+        samples = tuple(torch.cat(parts) for parts in zip(*self.memory, strict=True))
+        draws = self._draw(samples, self.feasibility_updates, self.feasibility_batch)
+        losses = self._fit(self.feasibility, self.feasibility_optimizer, samples, draws)
         with torch.no_grad():
-            sample = patch[batches[:8].flatten()]
-            reconstruction = self.feasibility.reconstruction(sample)
+            reconstruction = self.feasibility.reconstruction(samples[0][draws[:8].flatten()])
         levels = torch.tensor(QUANTILES, device=reconstruction.device)
         quantiles = torch.quantile(reconstruction, levels).tolist()
-        losses = {f"feasibility_{name}": value for name, value in sums.items()}
-        return losses | {f"L_recon_{q}": v for q, v in zip(QUANTILES, quantiles, strict=True)}
+        return {
+            **{f"feasibility_{name}": value for name, value in losses.items()},
+            **{f"L_recon_{q}": value for q, value in zip(QUANTILES, quantiles, strict=True)},
+        }
+
+    def _draw(self, samples: Sequence[Tensor], updates: int, batch: int) -> Tensor:
+        """Draw which samples each update learns from, [updates, batch]."""
+        return torch.randint(len(samples[0]), (updates, batch), device=samples[0].device)
+
+    def _fit(
+        self,
+        net: FeasibilityNet | ContextNet,
+        optimizer: torch.optim.Optimizer,
+        samples: Sequence[Tensor],
+        draws: Tensor,
+    ) -> dict[str, float]:
+        """Fit a net to the samples drawn; return the mean of each part of its loss."""
+        sums: dict[str, float] = {}
+        for chosen in draws:
+            loss, parts = net.loss(*(values[chosen] for values in samples))
+            self._descend(loss, net, optimizer)
+            for name, value in parts.items():
+                sums[name] = sums.get(name, 0.0) + value.item() / len(draws)
+        return sums
 
     def _descend(self, loss: Tensor, net: nn.Module, optimizer: torch.optim.Optimizer) -> None:
         """Take one step down the loss, along the mean gradient of all processes."""
@@ -129,7 +127,7 @@ class FeasibilityPPO(PPO):
         optimizer.step()
 
     def broadcast_parameters(self) -> None:
-        """Copy all networks from the first process to the others."""
+        """Copy all networks of the first process to every other one."""
         super().broadcast_parameters()
         for tensor in self.feasibility.state_dict().values():
             torch.distributed.broadcast(tensor, src=0)

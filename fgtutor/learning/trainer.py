@@ -33,6 +33,8 @@ OUTGROWN = 0.45
 """Share of the way to the last row at which, on the mean, robots have outgrown the first one."""
 LIFT = 0.25
 """Share of what is missing to full difficulty by which the first row is then lifted."""
+KEPT = ("iteration", "samples_before", "critic_warmup", "easiest", "seconds", "history")
+"""What a checkpoint keeps of the trainer's own fields."""
 
 
 class Trainer:
@@ -130,22 +132,22 @@ class Trainer:
             DivergedError: A number is no longer finite; what was saved before is kept.
         """
         if self.config.start_from and self.iteration in (0, self.critic_warmup):
-            warm = self.iteration < self.critic_warmup
-            self.algorithm.get_policy().requires_grad_(not warm)
+            self.algorithm.get_policy().requires_grad_(self.iteration >= self.critic_warmup)
             self.algorithm.learning_rate = self.config.learning_rate
         began, done = time.monotonic(), self.iteration / self.config.iterations
         self.algorithm.entropy_coef = self.config.entropy * max(0.0, 1 - 1.25 * done)
         for group in self.algorithm.feasibility_optimizer.param_groups:
             group["lr"] = self.config.feasibility_learning_rate * 0.05**done
         try:
-            self.runner.learn(1)
+            with contextlib.redirect_stdout(io.StringIO()):  # what rsl_rl says of its processes
+                self.runner.learn(1)
         except (RuntimeError, ValueError) as error:
             self._check_weights()
             if isinstance(error, ValueError):  # rsl_rl or MuJoCo met something that is no number
                 raise self._diverged(str(error).splitlines()[0]) from error
             raise
         self._check_weights()
-        self._quieten()
+        self._limit_noise()
         self.iteration += 1
         self.seconds += time.monotonic() - began
         row = {
@@ -184,18 +186,18 @@ class Trainer:
         return ""
 
     def _diverged(self, what: str) -> DivergedError:
-        how = "--learning-rate, or --feasibility-learning-rate or --context-learning-rate"
+        again = "anew"
         if self.saved:
-            again = f"from --from {self.config.folder}, which keeps iteration {self.saved},"
-            how = f"{how}, into another --out"
-        else:
-            again = "anew"
+            again = (
+                f"from --from {self.config.folder}, which keeps iteration {self.saved}, into "
+                "another --out,"
+            )
         return DivergedError(
             f"the training diverged in iteration {len(self.history) + 1} ({what}): begin {again} "
-            f"with a lower {how}"
+            "with a lower --learning-rate or --feasibility-learning-rate"
         )
 
-    def _harden(self, rows: torch.Tensor) -> torch.Tensor:
+    def _lift_first_row(self, rows: torch.Tensor) -> torch.Tensor:
         """Lift the first row where the robots have outgrown it; return the rows they stand on then.
 
         A robot keeps its difficulty, as far as there is still such a row.
@@ -211,7 +213,7 @@ class Trainer:
         return lifted.round().clamp(min=0).long()
 
     @torch.no_grad()
-    def _quieten(self) -> None:
+    def _limit_noise(self) -> None:
         """Hold the action noise down as far as the first row has risen."""
         config, last = self.config, self.config.easiest_at_last
         if last is None or config.std_at_last is None:
@@ -233,32 +235,18 @@ class Trainer:
         Of several processes the first one writes, for all of them.
         """
         mine = {"env": self.env.state_dict(), "torch_random": torch.get_rng_state()}
-        mine["env"]["row"] = self._harden(mine["env"]["row"])
+        mine["env"]["row"] = self._lift_first_row(mine["env"]["row"])
         first, *others = distributed.gather(mine)
         if leads():
-            self._write(first | {"others": others})
+            # The snapshot first: then a checkpoint always has the one that `_start_from` reads.
+            snapshot = self.config.folder / "snapshots" / f"{self.iteration}"
+            save_specialist(self.specialist(), snapshot)
+            own = {"config": comparable(self.config), "algorithm": self.algorithm.save()}
+            own |= {name: getattr(self, name) for name in KEPT}
+            write_checkpoint(self.checkpoint, own | first | {"others": others})
         self.saved = self.iteration
         self._renew(mine["env"])
         self.algorithm.memory.clear()
-
-    def _write(self, processes: dict[str, Any]) -> None:
-        """Write snapshot and checkpoint, with what is each process's own.
-
-        The snapshot comes first, so that a checkpoint always has the one that `_start_from` reads.
-        """
-        state = {
-            "config": comparable(self.config),
-            "iteration": self.iteration,
-            "samples_before": self.samples_before,
-            "critic_warmup": self.critic_warmup,
-            "easiest": self.easiest,
-            "seconds": self.seconds,
-            "history": self.history,
-            "algorithm": self.algorithm.save(),
-            **processes,
-        }
-        save_specialist(self.specialist(), self.config.folder / "snapshots" / f"{self.iteration}")
-        write_checkpoint(self.checkpoint, state)
 
     def _renew(self, state: dict[str, torch.Tensor]) -> None:
         """Move to the world that belongs to this iteration, with the curriculum of `state`."""
@@ -305,13 +293,11 @@ class Trainer:
             self.algorithm.load(state["algorithm"])
         if strange := self._strange_weights():
             raise ValueError(strange)
-        self.samples_before, self.critic_warmup = state["samples_before"], state["critic_warmup"]
-        warm = state["iteration"] < self.critic_warmup
-        self.algorithm.get_policy().requires_grad_(not warm)
-        self.iteration, self.seconds = state["iteration"], state["seconds"]
-        self.saved, self.easiest = self.iteration, state["easiest"]
+        for name in KEPT:
+            setattr(self, name, state[name])
+        self.saved = self.iteration
+        self.algorithm.get_policy().requires_grad_(self.iteration >= self.critic_warmup)
         self._renew(dict(own["env"]))
-        self.history = state["history"]
         self.specialist()  # raises where none could be made of it at the end
         torch.set_rng_state(own["torch_random"])
 

@@ -95,6 +95,7 @@ class ContextNet(nn.Module):
         history: Float[Tensor, "batch flat"],
         velocity: Float[Tensor, "batch 3"],
         following: Float[Tensor, "batch width"],
+        *,
         beta: float = BETA,
     ) -> tuple[Float[Tensor, ""], dict[str, Float[Tensor, ""]]]:
         """Return the loss of a beta-VAE that predicts the next frame, and its three parts.
