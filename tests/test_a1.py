@@ -11,7 +11,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.patches import prepare, sample_patches
 from fgtutor.policies.symmetry import SymmetricMLPModel
 from fgtutor.robots import ROBOTS
-from fgtutor.robots.a1 import observation
+from fgtutor.robots.a1 import rewards
 from fgtutor.robots.a1.env import A1_EPISODES, A1_GRID, A1Env, A1EnvConfig, _edges
 from fgtutor.robots.a1.model import JOINT_RANGES, STANCE
 from fgtutor.world.terrain import Terrain, World, make_terrain
@@ -305,19 +305,19 @@ def test_policy_answers_the_mirrored_observation_with_the_mirrored_action():
 
 
 def test_kernel_and_moving_by_hand():
-    assert observation.kernel(torch.tensor(0.5), 0.25).item() == pytest.approx(math.exp(-1))
-    assert observation.moving(torch.tensor([0.0, 0.5, 9.0])).tolist() == pytest.approx(
+    assert rewards.kernel(torch.tensor(0.5), 0.25).item() == pytest.approx(math.exp(-1))
+    assert rewards.moving(torch.tensor([0.0, 0.5, 9.0])).tolist() == pytest.approx(
         [1.0, 0.2 + 0.8 * math.exp(-1), 0.2]
     )
 
 
 def test_stance_share_is_a_trot():
     # A quarter of a cycle on, FR and RL stand, FL and RR swing; half a cycle later, reversed.
-    share = observation.stance_share(torch.tensor([0.0, 0.25, 0.75]))
+    share = rewards.stance_share(torch.tensor([0.0, 0.25, 0.75]))
     assert share[0].tolist() == pytest.approx([0.5] * 4, abs=1e-6)
     assert share[1].tolist() == pytest.approx([1, 0, 0, 1], abs=1e-6)
     # Standing and swinging overlap for a little: 0.5 + 1.2 sin(2 pi / 36).
-    early = observation.stance_share(torch.tensor([1 / 36]))[0, 0].item()
+    early = rewards.stance_share(torch.tensor([1 / 36]))[0, 0].item()
     assert early == pytest.approx(0.5 + 1.2 * math.sin(math.radians(10)))
     assert share[2].tolist() == pytest.approx([0, 1, 1, 0], abs=1e-6)
 
@@ -338,21 +338,21 @@ def test_stance_share_is_a_trot():
 )
 def test_gait_by_hand(stance, force, slide, clearance, expected):
     four = [torch.full((1, 4), value) for value in (stance, force, slide, clearance)]
-    value = observation.gait(*four, (0.04, 0.1)).item()
+    value = rewards.gait(*four, (0.04, 0.1)).item()
     assert value == pytest.approx(2 * expected - 1, abs=1e-6)
 
 
 def test_posture_limits_and_landing_by_hand():
     joints = torch.tensor([[0.2, 0.0, 0.0, -0.2, 0.0, 0.0] * 2] * 2)  # the feet brought together
     joints[1, 0], joints[1, 4] = 0.5, -0.5  # a hip and a thigh: 0.09 * 3 + 0.25 * 0.1
-    assert observation.posture(joints).tolist() == pytest.approx([1.0, math.exp(-0.295)])
+    assert rewards.posture(joints).tolist() == pytest.approx([1.0, math.exp(-0.295)])
     angles = torch.tensor([STANCE, STANCE])
     low, high = JOINT_RANGES["hip"]
     angles[1, 3] = high + 0.1  # soft limit: 95 % of a range symmetric about zero
-    assert observation.limits(angles).tolist() == pytest.approx([0.0, 0.1 + 0.05 * high], abs=1e-6)
+    assert rewards.limits(angles).tolist() == pytest.approx([0.0, 0.1 + 0.05 * high], abs=1e-6)
     assert low == -high
     force = torch.tensor([[60.0, 0.0, 135.0, 60.0], [185.0, 0.0, 1e4, 0.0]])
-    assert observation.landing(force).tolist() == pytest.approx([0.0, 2.5])
+    assert rewards.landing(force).tolist() == pytest.approx([0.0, 2.5])
 
 
 def test_reward_of_standing_still_by_hand():

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import onnx
@@ -26,9 +26,7 @@ from torch import Tensor
 from fgtutor.errors import ConfigError, ExportError, SpecialistError
 from fgtutor.io.progress import waiting
 from fgtutor.io.storage import atomic_write, check_writable, write_json
-from fgtutor.patches import HOLE_DEPTH, SPACING
 from fgtutor.robots import env_class
-from fgtutor.robots.base import LocomotionEnv
 from fgtutor.specialist import Specialist, load_specialist
 from fgtutor.world.terrain import World, make_terrain
 
@@ -41,7 +39,7 @@ METADATA = "fgtutor"
 TOLERANCE = 1e-4
 """Largest difference to torch, in action units; float32 sums differ by about a millionth."""
 FORMULA = "clip(scale * (clip(raw, *limits) - offset), -20, 20)"
-"""How a part of the observation is made from what was measured."""
+"""How a part of the observation is made of what was measured (see `robots.base.part`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +106,7 @@ def to_onnx(policy: MLPModel) -> onnx.ModelProto:
                 output_names=["action"],
                 dynamic_shapes=({0: torch.export.Dim("batch")},),
             )
-    except Exception as error:  # a policy class of somebody else's may do what ONNX cannot
+    except Exception as error:  # a policy class from elsewhere may do what ONNX cannot
         raise ExportError(
             f"a {type(policy).__name__} cannot be written as ONNX: {error!s:.300}"
         ) from error
@@ -117,10 +115,9 @@ def to_onnx(policy: MLPModel) -> onnx.ModelProto:
     model = program.model_proto
     # What the exporter notes down for its developers names files of this machine.
     graph = model.graph
-    for part in (graph, *graph.node, *graph.input, *graph.output, *graph.value_info):
+    values = (*graph.input, *graph.output, *graph.value_info, *graph.initializer)
+    for part in (graph, *graph.node, *values):
         part.ClearField("metadata_props")
-    for tensor in graph.initializer:
-        tensor.ClearField("metadata_props")
     return model
 
 
@@ -151,7 +148,7 @@ def describe(specialist: Specialist) -> dict[str, Any]:
     """
     ground = make_terrain("flat", robot=specialist.robot)
     env = env_class(specialist.robot)(World([[ground]]), 1)
-    parts, action = _a1(env) if specialist.robot == "a1" else _any(env)
+    parts, action = env.layout()
     frames = max(1, specialist.history)
     if specialist.history:
         parts = _felt(parts, env.felt)
@@ -183,80 +180,6 @@ def describe(specialist: Specialist) -> dict[str, Any]:
     }
 
 
-def _a1(env: LocomotionEnv) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Describe the A1's observation, in order, and its actions."""
-    from fgtutor.robots.a1.env import A1Env  # here, because the toy needs no MuJoCo
-    from fgtutor.robots.a1.model import JOINTS, STANCE, STANCE_HEIGHT
-    from fgtutor.robots.a1.observation import NOISE, SCAN_GRID, SCAN_LIMIT, SCAN_SCALE
-
-    settings, gains = cast(A1Env, env).settings, cast(A1Env, env).model
-    meaning = {
-        "velocity": "the trunk's velocity in its own frame (x ahead, y left, z up), m/s",
-        "gyroscope": "the trunk's rotation rate in its own frame, rad/s",
-        "gravity": "the direction of gravity in the trunk's frame, a unit vector",
-        "joints": "angles, rad, in the order of action.joints",
-        "joint rates": "the same joints' speeds, rad/s",
-        "last action": "the policy's previous answer; zeros at the start",
-        "clock": f"sin and cos of 2 pi {settings.gait_frequency:g} Hz t, from t = 0 at the start",
-    }
-    parts = [
-        _part(name, size, meaning[name], scale=scale, offset=STANCE if name == "joints" else 0.0)
-        for name, (size, _, scale) in NOISE.items()
-    ]
-    parts.append(_part("command", 3, "wanted vx, vy (m/s, yaw frame) and turn rate (rad/s)"))
-    scan = _part(
-        "scan",
-        SCAN_GRID.num_points,
-        "height of the ground minus that of the trunk's centre at `points`: ahead and left of the "
-        f"trunk's centre in the yaw frame, m; on a map in which holes end {HOLE_DEPTH:g} m below "
-        f"the ground around them, smoothed by a triangle reaching {SPACING:g} m to each side",
-        scale=SCAN_SCALE,
-        offset=-STANCE_HEIGHT,
-        limits=(-SCAN_LIMIT, SCAN_LIMIT),
-    )
-    parts.append(scan | {"points": np.round(SCAN_GRID.points.numpy(), 4).tolist()})
-    action = {
-        "size": len(JOINTS),
-        "meaning": "joint targets, rad: offset + scale * action",
-        "joints": list(JOINTS),
-        "offset": list(STANCE),
-        "scale": settings.action_scale,
-        "stiffness": gains.kp,
-        "damping": gains.kd,
-        "torque limit": gains.torque_limit,
-    }
-    return parts, action
-
-
-def _any(env: LocomotionEnv) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Describe another robot's observation by its sizes; its own file says what they mean."""
-    here = f"see {type(env).__name__} in {type(env).__module__}"
-    felt, scan = env.proprioception().shape[-1], env.scan(env.patches()).shape[-1]
-    parts = [_part("proprioception", felt, here), _part("command", 3, "wanted vx, vy, turn rate")]
-    return [*parts, _part("scan", scan, here)], {"size": env.num_actions, "meaning": here}
-
-
-def _part(
-    name: str,
-    size: int,
-    meaning: str,
-    *,
-    scale: float = 1.0,
-    offset: float | tuple[float, ...] = 0.0,
-    limits: tuple[float, float] | None = None,
-) -> dict[str, Any]:
-    """Describe one part of the observation; see `FORMULA`."""
-    each = list(offset) if isinstance(offset, tuple) else offset
-    return {
-        "name": name,
-        "size": size,
-        "meaning": meaning,
-        "limits": limits and list(limits),
-        "offset": each,
-        "scale": scale,
-    }
-
-
 def _felt(parts: list[dict[str, Any]], felt: tuple[int, ...]) -> list[dict[str, Any]]:
     """Return the parts that a blind policy reads: those of which it feels every number."""
     ends = np.cumsum([part["size"] for part in parts])
@@ -279,13 +202,12 @@ def _answer(policy: MLPModel, observations: Tensor) -> Tensor:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep torch's exporter from reporting its own affairs: old APIs, libraries it did not find."""
+    """Silence what torch's exporter says about old APIs and libraries that it did not find."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             yield
     finally:
         logger.setLevel(level)

@@ -27,6 +27,9 @@ from fgtutor.policies.symmetry import Mirror
 from fgtutor.robots.crossings import UNTRIED, Crossings, EnvConfig, slowdown, turn_rate
 from fgtutor.world.terrain import TerrainSeed, World
 
+Layout = tuple[list[dict[str, Any]], dict[str, Any]]
+"""The parts of the observation in order (see `part`), and what an action means."""
+
 
 def plain_tensors(method: Callable[..., Any]) -> Callable[..., Any]:
     """Run a method so that what it makes are ordinary tensors without gradients.
@@ -148,11 +151,8 @@ class LocomotionEnv(VecEnv):
         """Return what is `unfelt`; a robot with noisy observations returns it without noise."""
         return policy[:, list(self.unfelt)]
 
-    def layout(self) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-        """Describe the parts of the `policy` group in order, and the action, for `fgtutor export`.
-
-        By default their sizes only; see `part` for the rest.
-        """
+    def layout(self) -> Layout:
+        """Describe the `policy` group and the action for `fgtutor export`; here, by sizes only."""
         here = f"see {type(self).__name__} in {type(self).__module__}"
         felt, scan = self.proprioception().shape[-1], self.scan(self.patches()).shape[-1]
         command = part("command", 3, "wanted vx, vy, turn rate")

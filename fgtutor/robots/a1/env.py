@@ -23,7 +23,7 @@ from torch import Tensor
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.patches import PatchGrid, ground_height, rotate, sample_heights
-from fgtutor.robots.a1 import observation
+from fgtutor.robots.a1 import observation, rewards
 from fgtutor.robots.a1.model import (
     FOOT_RADIUS,
     STANCE,
@@ -41,7 +41,7 @@ from fgtutor.robots.a1.observation import (
 )
 from fgtutor.robots.a1.physics import Physics
 from fgtutor.robots.a1.randomise import A1EnvConfig, randomise
-from fgtutor.robots.base import LocomotionEnv
+from fgtutor.robots.base import Layout, LocomotionEnv
 from fgtutor.robots.crossings import EnvConfig
 from fgtutor.world.terrain import World
 
@@ -293,6 +293,11 @@ class A1Env(LocomotionEnv):
         """Return the trunk's velocity in its own frame, without noise, scaled as observed."""
         return (self.body_velocity * self.scale[:3]).clamp(-20.0, 20.0)
 
+    def layout(self) -> Layout:
+        """Describe the observation and the action."""
+        settings = self.settings
+        return observation.layout(self.model, settings.action_scale, settings.gait_frequency)
+
     def patches(self) -> Float[Tensor, "envs points"]:
         """Return the patches that `sample_patches` would; the scan shares their points."""
         points = self.pose[:, None, :2] + rotate(self.look_points, self.pose[:, 3])
@@ -340,28 +345,28 @@ class A1Env(LocomotionEnv):
         turn = self.velocity[:, 2] - self.command[:, 2]
         # Felt by its nose: who is told to turn on the spot and does not has no other speed to miss.
         nose = torch.hypot(wrong, NOSE * turn)
-        style = observation.moving(nose)
+        style = rewards.moving(nose)
         force = self._feet("foot_force").norm(dim=-1)
         foot = self._feet("foot_position")
-        gait = observation.gait(
-            observation.stance_share(self.clock),
+        gait = rewards.gait(
+            rewards.stance_share(self.clock),
             force,
             self._feet("foot_velocity").norm(dim=-1),
             foot[..., 2] - FOOT_RADIUS - self._lookup(self.edges, foot[..., :2]),
             self.settings.swing_height,
         )
         terms = {
-            "tracking": observation.kernel(wrong, 0.1),
-            "approach": observation.kernel(nose, 0.25),
-            "turning": style * observation.kernel(turn, 0.25),
+            "tracking": rewards.kernel(wrong, 0.1),
+            "approach": rewards.kernel(nose, 0.25),
+            "turning": style * rewards.kernel(turn, 0.25),
             "gait": style * gait,
-            "posture": style * observation.posture(self.q[:, 7:] - self.stance),
+            "posture": style * rewards.posture(self.q[:, 7:] - self.stance),
             "orientation": self.up[:, :2].square().sum(-1),
             "bounce": self.v[:, 2].square(),
             "wobble": self.v[:, 3:5].square().sum(-1),
-            "limits": observation.limits(self.q[:, 7:]),
+            "limits": rewards.limits(self.q[:, 7:]),
             "jerk": self.action_change.square().sum(-1),
-            "landing": observation.landing(force),
+            "landing": rewards.landing(force),
         }
         weights = self.settings.weights
         return {f.name: getattr(weights, f.name) * terms[f.name] for f in fields(weights)}

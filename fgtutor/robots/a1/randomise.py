@@ -12,8 +12,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from fgtutor.io.validation import Ascending, Share, check_fields
-from fgtutor.robots.a1.observation import RewardWeights
 from fgtutor.robots.a1.physics import Physics
+from fgtutor.robots.a1.rewards import RewardWeights
 
 Friction = Annotated[float, Interval(gt=0, le=5)]
 """A coefficient of friction."""
