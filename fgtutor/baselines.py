@@ -191,7 +191,7 @@ class AssessedMap:
             # ask for both.
             team = [name] if name == GENERAL else self.specialists
             asked = {member: self.zoo[member] for member in team}
-            self._known.update(assess_all(self.elevation, asked, self.taus))
+            self._known.update(assess_all(self.elevation, asked, taus=self.taus))
         return self._known[name]
 
     def tensors(self, *names: str) -> "Layers":

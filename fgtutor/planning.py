@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
@@ -50,7 +51,7 @@ from fgtutor.io.machine import require_memory
 from fgtutor.io.progress import QUICK, duration
 from fgtutor.io.validation import numbers
 from fgtutor.routes import Refusal, Route
-from fgtutor.settings import PAPER, SETTINGS, PlanSettings
+from fgtutor.settings import PAPER, SETTINGS, PlanSettings, Unknown
 from fgtutor.specialist import Specialist
 from fgtutor.tensorization import assess_all
 
@@ -75,7 +76,10 @@ SECONDS_PER_STATE = 1.5e-6
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The answer of `plan_on_map`, with every stage that led to it."""
+    """The answer of `plan_on_map`, with every stage that led to it.
+
+    The stages are empty where start or goal was never observed: then nothing was assessed.
+    """
 
     names: tuple[str, ...]
     """The policies, in the order that indices count."""
@@ -119,11 +123,15 @@ def plan_on_map(
         raise ConfigError("planning needs at least one specialist, the zoo is empty")
     settings = replace(settings or PlanSettings(), **changes)
     _check_memory(elevation, len(zoo), settings.switch_cost)
-    for point, role in ((start, "start"), (goal, "goal")):
-        check_point(elevation, point, role)
+    try:
+        for point, role in ((start, "start"), (goal, "goal")):
+            usable_cell(elevation, point, role, settings.unknown)
+    except UnknownCellError as error:  # known before the map is assessed, which may take minutes
+        nothing = torch.empty(0)
+        return Plan(tuple(zoo), [], {}, nothing, nothing, Refusal(error))
     known, weights = dict(tensors or {}), {}
     asked = {name: one for name, one in zoo.items() if name not in known}
-    assessments = assess_all(elevation, asked, settings.taus, progress=progress)
+    assessments = assess_all(elevation, asked, taus=settings.taus, progress=progress)
     for name in asked:  # each is let go as soon as it is weighted: large maps need the memory
         assessment = assessments.pop(name)
         weights[name] = assessment.ood()
@@ -260,7 +268,11 @@ class _Problem:
 
     def cheapest(self, start: Point, goal: Point) -> Route:
         """Return the cheapest route, or raise the `PlanningError` that says why there is none."""
-        ends = self._cell_of(start, "start"), self._cell_of(goal, "goal")
+        unknown = self.settings.unknown
+        ends = tuple(
+            usable_cell(self.grid, point, role, unknown)
+            for point, role in ((start, "start"), (goal, "goal"))
+        )
         if ends[0] == ends[1]:
             return self._route(np.array([[0, *ends[0]]]))
         self._check_open(start, goal)
@@ -303,16 +315,6 @@ class _Problem:
             ood=None if self.ood is None else self.ood[(slice(None), *at)].T,
         )
 
-    def _cell_of(self, point: Point, role: str) -> Cell:
-        """Return the cell of the start or goal; raise if it is off the map or not known."""
-        cell = check_point(self.grid, point, role)
-        if self.settings.unknown == "block" and not self.grid.known[cell]:
-            raise UnknownCellError(
-                f"the {role} {self._text(point)} m lies on cell {cell}, which was never observed: "
-                f'move the {role}, scan that place, or trust filled heights with unknown="fill"'
-            )
-        return cell
-
     def _check_open(self, start: Point, goal: Point) -> None:
         """Raise unless some step leaves the start and some step enters the goal."""
         cell, end = self.grid.cell_of(*start), self.grid.cell_of(*goal)
@@ -338,24 +340,31 @@ class _Problem:
         return point_text(point, self.grid.resolution)
 
 
-def check_point(grid: ElevationMap, point: Point, role: str) -> Cell:
-    """Return the cell of a start or goal (`role`).
+def usable_cell(grid: ElevationMap, point: Point, role: str, unknown: Unknown) -> Cell:
+    """Return the cell of the start or goal (`role`), or say why it cannot be one.
 
     Raises:
-        OffMapError: The point is off the map.
+        OffMapError, UnknownCellError: The point is off the map, or was never observed.
         ConfigError: It is no point.
     """
     try:
         x, y = (float(value) for value in point)
     except (TypeError, ValueError):
         raise ConfigError(f"the {role} must be a point (x, y) in metres, got {point!r}") from None
+    place = f"the {role} {point_text((x, y), grid.resolution)} m"
     if not grid.contains(x, y):
         x0, y0, x1, y1 = (coordinate_text(value, grid.resolution) for value in grid.extent)
         raise OffMapError(
-            f"the {role} {point_text((x, y), grid.resolution)} m is off the map, which covers x "
-            f"{x0}..{x1} m and y {y0}..{y1} m: move the {role} inside, or load a larger map"
+            f"{place} is off the map, which covers x {x0}..{x1} m and y {y0}..{y1} m: move the "
+            f"{role} inside, or load a larger map"
         )
-    return grid.cell_of(x, y)
+    cell = grid.cell_of(x, y)
+    if unknown == "block" and not grid.known[cell]:
+        raise UnknownCellError(
+            f"{place} lies on cell {cell}, which was never observed: move the {role}, scan that "
+            'place, or trust filled heights with unknown="fill"'
+        )
+    return cell
 
 
 def _check_memory(grid: ElevationMap, policies: int, switch_cost: float) -> None:

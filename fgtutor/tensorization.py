@@ -105,16 +105,16 @@ def tensorize(
     """
     if unknown not in get_args(Unknown):
         raise ConfigError(f"unknown must be one of {', '.join(get_args(Unknown))}, got {unknown!r}")
-    assessment = assess(elevation, specialist, taus=taus, method=method, progress=progress)
+    assessment = assess(elevation, specialist, method, taus=taus, progress=progress)
     return assessment.weighted(unknown=unknown)
 
 
 def assess(
     elevation: ElevationMap,
     specialist: Specialist,
+    method: Method = "auto",
     *,
     taus: Taus = "calibrated",
-    method: Method = "auto",
     progress: bool = False,
 ) -> Assessment:
     """Return f and L_recon of every cell and heading; unknown cells are read as filled.
@@ -122,17 +122,18 @@ def assess(
     Give the map as it was loaded: it is prepared for patches here. "auto" is the fast way, which
     won on every map measured. Raises what `tensorize` raises.
     """
-    zoo = {specialist.name: specialist}
-    return assess_all(elevation, zoo, taus, method, progress=progress)[specialist.name]
+    team = {specialist.name: specialist}
+    said = assess_all(elevation, team, method, taus=taus, progress=progress)
+    return said[specialist.name]
 
 
 @torch.no_grad()
 def assess_all(
     elevation: ElevationMap,
     zoo: Mapping[str, Specialist],
-    taus: Taus = "calibrated",
     method: Method = "auto",
     *,
+    taus: Taus = "calibrated",
     progress: bool = False,
 ) -> dict[str, Assessment]:
     """Return what each policy of `zoo` says; those with the same patch grid share its patches.

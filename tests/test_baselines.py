@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from fgtutor.baselines import (
+    AssessedMap,
     OccupancyConfig,
     TraversabilityConfig,
-    View,
     classical,
     classical_switched,
     find_route,
@@ -22,10 +22,12 @@ from fgtutor.baselines import (
     without_ood,
 )
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError, PlanningError
+from fgtutor.errors import ConfigError
+from fgtutor.planning import PAPER, Refusal
 from fgtutor.tensorization import Assessment, assess_all, tensorize
 
 RADIUS = 0.1
+TAUS = (1.0, 3.0)
 
 
 def ground(heights, resolution=0.1):
@@ -114,50 +116,48 @@ def test_thresholds_are_settings():
 
 
 @pytest.fixture
-def view(make_specialist):
+def assessed(make_specialist):
     """Three untrained policies on bumpy ground with one unknown cell."""
     rng = np.random.default_rng(1)
     heights = rng.random((10, 8)) * 0.05
     heights[2, 3] = np.nan
     zoo = {name: make_specialist(name, seed=i) for i, name in enumerate(("gaps", "steps"))}
     zoo["general"] = make_specialist("general", seed=7)
-    return View(ground(heights), zoo, "calibrated")
+    return AssessedMap(ground(heights), zoo, "calibrated")
 
 
-def test_a_view_asks_the_generalist_only_where_its_answer_is_wanted(view, monkeypatch):
+def test_the_generalist_is_assessed_only_where_it_is_asked_for(assessed, monkeypatch):
     asked = []
 
-    def noted(elevation, zoo):
+    def noted(elevation, zoo, **options):
         asked.append(sorted(zoo))
-        return assess_all(elevation, zoo)
+        return assess_all(elevation, zoo, **options)
 
     monkeypatch.setattr("fgtutor.baselines.assess_all", noted)
-    view.tensor("steps"), view.tensor("gaps")
+    assessed.tensors("steps"), assessed.tensors("gaps")
     assert asked == [["gaps", "steps"]]
-    view.tensor("general")
+    assessed.tensors("general")
     assert asked == [["gaps", "steps"], ["general"]]
 
 
-def test_a_view_gives_what_tensorize_gives_and_computes_it_once(view, monkeypatch):
-    for name, specialist in view.zoo.items():
-        expected = tensorize(view.elevation, specialist, taus="calibrated")
-        assert torch.equal(view.tensor(name), expected)
+def test_an_assessed_map_gives_what_tensorize_gives_and_computes_it_once(assessed, monkeypatch):
+    for name, specialist in assessed.zoo.items():
+        expected = tensorize(assessed.elevation, specialist, taus="calibrated")
+        assert torch.equal(assessed.tensors(name)[name], expected)
     monkeypatch.setattr("fgtutor.baselines.assess_all", None)  # a second call would fail
-    assert view.f("steps").shape == (10, 8, 8)
-    assert view.specialists == ["gaps", "steps"]
-    assert view.radius == 0.1
+    assert list(assessed.tensors()) == ["gaps", "steps"]
+    assert assessed.specialists == ["gaps", "steps"]
+    assert assessed.radius == 0.1
 
 
-def analytic(view, f, reconstruction):
-    """Let the view believe constants instead of its networks."""
-    for name in view.zoo:
-        numbers = f[name].expand(10, 8, 8).clone(), reconstruction[name].expand(10, 8, 8).clone()
-        view._known[name] = Assessment(*numbers)
-    return view
+def by_hand(elevation, f, reconstruction):
+    """Return an assessment by `TAUS` of constants, or of one number per heading."""
+    shape = (*elevation.shape, 8)
+    return Assessment(f.expand(shape), reconstruction.expand(shape), elevation, TAUS)
 
 
 @pytest.fixture
-def known(view):
+def known(assessed):
     """gaps: f 0.9 but unfamiliar (w_ood = 0.5); steps: f 0.8 along +x only, else 0.4; familiar."""
     flat = ground(np.zeros((10, 8)))
     along_x = torch.full((8,), 0.4)
@@ -165,7 +165,8 @@ def known(view):
     f = {"gaps": torch.tensor(0.9), "steps": along_x, "general": torch.tensor(0.6)}
     # Eq. 4 with tau 1 and 3: a loss of 2 lies half way.
     loss = {"gaps": torch.tensor(2.0), "steps": torch.tensor(0.0), "general": torch.tensor(0.0)}
-    return analytic(View(flat, view.zoo, (1.0, 3.0)), f, loss)
+    numbers = {name: by_hand(flat, f[name], loss[name]) for name in f}
+    return AssessedMap(flat, assessed.zoo, TAUS, numbers)
 
 
 def inner(layers, name):
@@ -189,7 +190,7 @@ def test_parts_left_out_by_hand(known):
 
 def test_each_planner_drives_with_its_policies(known):
     def drivers(planner, start=(0.15, 0.45), goal=(0.85, 0.45)):
-        route = find_route(planner, known, start, goal)
+        route = find_route(planner, known, start, goal, PAPER)
         return [route.names[i] for i in route.policies], route.cost
 
     # Along +x: steps at 0.8; without w_ood gaps believes 0.9.
@@ -203,7 +204,7 @@ def test_each_planner_drives_with_its_policies(known):
     # On a flat classical map a diagonal step costs as much as a straight one: any way will do, and
     # P says who drives it.
     switched = find_route(
-        partial(classical_switched, traversability), known, (0.15, 0.45), (0.85, 0.45)
+        partial(classical_switched, traversability), known, (0.15, 0.45), (0.85, 0.45), PAPER
     )
     wanted = ["gaps" if heading else "steps" for heading in switched.headings]
     assert [switched.names[i] for i in switched.policies] == wanted
@@ -211,33 +212,33 @@ def test_each_planner_drives_with_its_policies(known):
 
 
 def test_a_classical_map_refuses_what_a_specialist_crosses(known):
-    high = View(wall(0.16, n=10), known.zoo, known.taus, known._known)
+    elevation = wall(0.16, n=10)
+    numbers = {"steps": by_hand(elevation, torch.tensor(0.8), torch.tensor(0.0))}
+    high = AssessedMap(elevation, known.zoo, TAUS, numbers)
     steps = partial(single, "steps")
-    known._known["steps"] = Assessment(torch.full((10, 11, 8), 0.8), torch.zeros(10, 11, 8))
     assert find_route(steps, high, (0.15, 0.5), (0.95, 0.5)).names == ("steps",)
-    with pytest.raises(PlanningError):
-        find_route(partial(classical, traversability), high, (0.15, 0.5), (0.95, 0.5))
-    with pytest.raises(PlanningError):
-        find_route(partial(classical, occupancy), high, (0.15, 0.5), (0.95, 0.5))
+    for cells in (traversability, occupancy):
+        answer = find_route(partial(classical, cells), high, (0.15, 0.5), (0.95, 0.5))
+        assert isinstance(answer, Refusal) and "no policy can" in answer.reason
 
 
-def test_planners_are_those_that_the_zoo_allows(view):
-    everyone = list(planners(view.zoo))
+def test_planners_are_those_that_the_zoo_allows(assessed):
+    everyone = list(planners(assessed.zoo))
     assert everyone[:4] == ["gaps", "steps", "ours", "general"]
-    specialists = {name: view.zoo[name] for name in view.specialists}
+    specialists = {name: assessed.zoo[name] for name in assessed.specialists}
     assert set(everyone) - set(planners(specialists)) == {"general", "traversability", "occupancy"}
     with pytest.raises(ConfigError, match="zoo is empty"):
-        find_route(without_fusion, View(view.elevation, {}), (0.1, 0.1), (0.5, 0.5))
+        find_route(without_fusion, AssessedMap(assessed.elevation, {}), (0.1, 0.1), (0.5, 0.5))
 
 
-def test_a_diagonal_step_costs_its_length_if_asked_to(view):
-    flat = View(ground(np.zeros((12, 12))), view.zoo, "calibrated")
+def test_a_diagonal_step_costs_its_length_if_asked_to(assessed):
+    flat = AssessedMap(ground(np.zeros((12, 12))), assessed.zoo, "calibrated")
 
-    def uniform(view):
+    def uniform(ground):
         return [{"steps": torch.full((12, 12, 8), 0.5)}]
 
     ends = (0.25, 0.25), (0.75, 0.75)  # five cells along each axis
-    counted = find_route(uniform, flat, *ends)
-    measured = find_route(uniform, flat, *ends, cost="length")
+    counted = find_route(uniform, flat, *ends, cost="inverse")
+    measured = find_route(uniform, flat, *ends)
     assert counted.cost == pytest.approx(5 / 0.5)
     assert measured.cost == pytest.approx(5 * 0.1 * np.sqrt(2) / 0.5)

@@ -1,6 +1,7 @@
 """Planning: costs against networkx, routes known by hand, errors that say what to change."""
 
 import json
+import pickle
 import re
 
 import networkx
@@ -10,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fgtutor import directions
+from fgtutor import directions, planning
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import (
     ConfigError,
@@ -22,11 +23,10 @@ from fgtutor.errors import (
     UnreachableError,
 )
 from fgtutor.fusion import fuse
-from fgtutor.graphs import reversed_graph
+from fgtutor.graphs import Search, reversed_graph
 from fgtutor.grid import point_text
 from fgtutor.io import machine
-from fgtutor.planning import Planner, Route, as_networkx, as_switching_networkx, plan
-from fgtutor.tensorization import steps_on_known
+from fgtutor.planning import PAPER, PlanSettings, Refusal, Route, as_networkx, as_switching_networkx
 
 BACKENDS = ("networkx", "scipy")
 RESOLUTION = 0.2
@@ -34,6 +34,11 @@ RESOLUTION = 0.2
 
 def flat(nx: int, ny: int, known: np.ndarray | None = None) -> ElevationMap:
     return ElevationMap(np.zeros((nx, ny)), resolution=RESOLUTION, origin=(-1.0, 3.0), known=known)
+
+
+def plan(*arguments, **options) -> Route:
+    """Plan by the paper's settings, but for the options; raise what is refused."""
+    return planning.plan(*arguments, **{"settings": PAPER} | options).raise_for()
 
 
 def random_problem(seed: int, policies: int = 3):
@@ -179,7 +184,7 @@ def test_a_detour_is_taken_when_it_pays(backend, slow, rows):
     tensor[:, 0] = 0.8
     tensor[2, 1] = slow
     tensor[1, 1, 0] = slow
-    tensor[1, :, [1, 7]] = 0.0  # nobody cuts diagonally into column 2
+    tensor[1, :, [1, 7]] = 0.0  # no way leads diagonally into column 2
     ends = {"start": grid.centre_of(0, 1), "goal": grid.centre_of(4, 1)}
     route = plan(tensor, np.zeros(tensor.shape), grid=grid, backend=backend, **ends)
     assert set(route.cells[:, 1]) == rows
@@ -286,19 +291,66 @@ def test_a_switch_happens_where_both_policies_are_feasible(backend):
     assert column in (3, 4, 5)
 
 
-def test_one_search_answers_many_starts():
-    tensors, grid, _, goal = random_problem(7)
-    fused, policy_map = fuse(tensors)
-    tree = Planner(fused=fused, policy_map=policy_map, grid=grid).towards(goal)
-    for cell in np.ndindex(grid.shape):
-        start = grid.centre_of(*cell)
-        if not np.isfinite(tree.cost_to_goal[cell]):
-            with pytest.raises(PlanningError):
-                tree.route(start)
-            continue
-        forwards = plan(fused, policy_map, grid=grid, start=start, goal=goal, backend="networkx")
-        assert tree.route(start).cost == pytest.approx(forwards.cost, abs=1e-9)
-        assert tree.cost_to_goal[cell] == pytest.approx(forwards.cost, abs=1e-9)
+@pytest.mark.parametrize(
+    ("cell", "error"),
+    [((4, 4), UnknownCellError), ((0, 4), InfeasibleCellError), ((4, 0), UnreachableError)],
+)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_refusal_is_a_value_with_its_reason(backend, cell, error):
+    tensor, grid = one_island()
+    ends = {"start": grid.centre_of(2, 2), "goal": grid.centre_of(*cell)}
+    answer = planning.plan(tensor, np.zeros(tensor.shape), grid=grid, backend=backend, **ends)
+    assert isinstance(answer, Refusal) and not answer and isinstance(answer.error, error)
+    assert answer.reason == str(answer.error) and answer.reason in repr(answer)
+    with pytest.raises(error):
+        answer.raise_for()
+    with pytest.raises(AttributeError, match="no route, so no 'xy': "):
+        answer.xy  # noqa: B018
+    again = pickle.loads(pickle.dumps(answer))
+    assert again.reason == answer.reason and type(again.error) is error
+
+
+def test_our_settings_are_the_default_and_the_papers_have_a_name():
+    walker, climber = two_specialists()
+    fused, policy_map = fuse([walker, climber])
+    grid = flat(7, 3)
+    ends = {"grid": grid, "start": grid.centre_of(0, 1), "goal": grid.centre_of(6, 1)}
+    known = ends | {"tensors": [walker, climber]}
+    for settings, cost in ((None, 8 * RESOLUTION + 2), (PlanSettings(), 8 * RESOLUTION + 2)):
+        # A switch before the wall and one after it, where both can walk: 1 each. From there on the
+        # climber would cost no less.
+        route = planning.plan(fused, policy_map, settings=settings, **known)
+        assert route.cost <= cost + 1e-9
+        assert route.cost == pytest.approx(min(cost, 12 * RESOLUTION))
+    assert planning.plan(fused, policy_map, settings=PAPER, **known).cost == pytest.approx(8)
+    # Without the tensors nothing is known of the other policies: switching is free.
+    assert planning.plan(fused, policy_map, **ends).cost == pytest.approx(8 * RESOLUTION)
+    with pytest.raises(ConfigError, match="tensors"):
+        planning.plan(fused, policy_map, settings=PlanSettings(), **ends)
+    with pytest.raises(TypeError, match="f_mn"):
+        planning.plan(fused, policy_map, f_mn=0.2, **ends)
+
+
+@pytest.mark.parametrize("cost", ["inverse", "length"])
+@pytest.mark.parametrize("switch_cost", [0.05, 1.0, 20.0])
+@pytest.mark.parametrize("seed", range(6))
+def test_the_narrowed_search_finds_what_the_whole_one_does(seed, switch_cost, cost):
+    """Smooth tensors narrow much, rough ones little, and far ends leave room for detours."""
+    rng = np.random.default_rng(seed)
+    tensors = rng.random((3, 30, 22, 8))
+    for _ in range(seed % 3):
+        tensors = (tensors + np.roll(tensors, 1, axis=1) + np.roll(tensors, 1, axis=2)) / 3
+    grid = flat(30, 22)
+    layers = np.where(grid.known_steps & (tensors >= 0.2), tensors, 0)
+    search = Search(layers, switch_cost, cost, RESOLUTION)
+    for start, goal in (((0, 0), (29, 21)), ((5, 15), (20, 3)), ((9, 9), (10, 9))):
+        whole, distance = search._backwards(search._reversed(), start, goal)
+        assert whole is not None
+        first = np.ravel_multi_index((np.arange(3), *start), layers.shape[:3])
+        ends = {"start": grid.centre_of(*start), "goal": grid.centre_of(*goal)}
+        options = {"f_min": 0.2, "cost": cost, "switch_cost": switch_cost, "grid": grid}
+        route = plan(*fuse(tensors), tensors=tensors, **ends, **options)
+        assert route.cost == pytest.approx(distance[first].min(), abs=1e-9)
 
 
 @pytest.mark.parametrize("switch_cost", [0.0, 1.0])
@@ -470,22 +522,22 @@ def test_both_switching_graphs_cost_the_same_from_every_cell(seed, cost):
     tensors, grid, _, goal = random_problem(seed, policies=4)
     if seed % 2:
         tensors[1][tensors[0] > 0] = 0.6  # whatever 0 can, 1 can too
-    fused, policy_map = fuse(tensors)
-    settings = {"grid": grid, "switch_cost": 0.7, "cost": cost, "tensors": tensors}
-    planner = Planner(fused=fused, policy_map=policy_map, **settings)
-    tree = planner.towards(goal)
-    graph = as_switching_networkx(planner.layers, 0.7, cost=cost, resolution=RESOLUTION)
+    layers = np.where(grid.known_steps & (np.stack(tensors) >= 0.1), tensors, 0)
+    search = Search(layers, 0.7, cost, RESOLUTION)
     end = grid.cell_of(*goal)
+    _, distance = search._backwards(search._reversed(), end, end)
+    graph = as_switching_networkx(layers, 0.7, cost=cost, resolution=RESOLUTION)
     cheapest = networkx.multi_source_dijkstra_path_length(
         graph.reverse(), [(*end, policy) for policy in range(4)]
     )
-    for policy, ix, iy in np.ndindex(tree.distance.shape):
+    for policy, ix, iy in np.ndindex(layers.shape[:3]):
         expected = cheapest.get((ix, iy, policy), np.inf)
-        assert tree.distance[policy, ix, iy] == pytest.approx(expected, abs=1e-9)
+        found = distance[np.ravel_multi_index((policy, ix, iy), layers.shape[:3])]
+        assert found == pytest.approx(expected, abs=1e-9)
 
 
 def test_a_change_of_policy_takes_one_edge_where_the_old_one_can_take_every_step():
-    layers = np.ones((4, 30, 30, 8)) * steps_on_known(np.ones((30, 30), dtype=bool))
+    layers = np.ones((4, 30, 30, 8)) * flat(30, 30).known_steps
     count = reversed_graph(layers, 1.0, "inverse", 0.1).nnz
     steps = np.count_nonzero(layers[0])
     assert count == 4 * steps + 4 * 3 * 900 and count < 0.4 * 4 * 4 * steps

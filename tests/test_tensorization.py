@@ -17,9 +17,7 @@ from fgtutor.tensorization import (
     assess,
     assess_all,
     resolve_taus,
-    steps_on_known,
     tensorize,
-    tensorize_all,
     why_blocked,
 )
 
@@ -154,10 +152,10 @@ def test_lifting_the_map_changes_nothing(make_specialist):
 def test_adding_a_policy_leaves_the_others_as_they_were(make_specialist):
     elevation = rough(15, 11)
     first, second = make_specialist("first"), make_specialist("second", seed=1)
-    alone = tensorize(elevation, first)
-    tensorize(elevation, second)
-    assert torch.equal(tensorize(elevation, first), alone)
-    assert not torch.equal(tensorize(elevation, second), alone)
+    alone = tensorize(elevation, first, taus="paper")
+    tensorize(elevation, second, taus="paper")
+    assert torch.equal(tensorize(elevation, first, taus="paper"), alone)
+    assert not torch.equal(tensorize(elevation, second, taus="paper"), alone)
 
 
 def test_a_team_is_assessed_as_each_policy_alone(make_specialist):
@@ -171,8 +169,9 @@ def test_a_team_is_assessed_as_each_policy_alone(make_specialist):
         alone = assess(elevation, team[name])
         assert torch.equal(one.f, alone.f)
         assert torch.equal(one.reconstruction, alone.reconstruction)
-    for name, tensor in tensorize_all(elevation, team, taus=(0.1, 5.0)).items():
-        assert torch.equal(tensor, tensorize(elevation, team[name], taus=(0.1, 5.0)))
+    for name, one in assess_all(elevation, team, taus=(0.1, 5.0)).items():
+        assert torch.equal(one.weighted(), tensorize(elevation, team[name], taus=(0.1, 5.0)))
+        assert one.specialist is team[name] and one.elevation is elevation
 
 
 def test_equal_patches_are_assessed_once(make_specialist, monkeypatch):
@@ -201,6 +200,9 @@ def test_tensorize_weighs_f_by_familiarity(make_specialist):
     assessment = assess(elevation, specialist)
     w_ood = (1 - (assessment.reconstruction - 0.3) / 1.2).clamp(0, 1)
     close(assessment.ood(0.3, 1.5), w_ood, 1e-6)
+    assert torch.equal(
+        assess(elevation, specialist, taus=(0.3, 1.5)).ood(), assessment.ood(0.3, 1.5)
+    )
     tensor = tensorize(elevation, specialist, taus=(0.3, 1.5), unknown="fill")
     close(tensor, w_ood * assessment.f, 1e-6)
     assert 0 < w_ood.mean() < 1
@@ -252,9 +254,9 @@ def test_no_step_leaves_the_map(make_specialist):
 
 
 @given(st.integers(2, 5), st.integers(2, 5), st.integers(0, 2**16))
-def test_steps_on_known_cell_by_cell(nx, ny, seed):
+def test_steps_within_cell_by_cell(nx, ny, seed):
     known = np.random.default_rng(seed).random((nx, ny)) < 0.7
-    steps = steps_on_known(known)
+    steps = directions.steps_within(known)
     for ix, iy, heading in np.ndindex(nx, ny, 8):
         x, y = np.array((ix, iy)) + directions.STEPS[heading]
         there = 0 <= x < nx and 0 <= y < ny and known[x, y]
@@ -263,14 +265,13 @@ def test_steps_on_known_cell_by_cell(nx, ny, seed):
 
 def test_why_blocked_names_the_layer(make_specialist):
     elevation, specialist = with_hole(), make_specialist("steps")
-    assessments = {"steps": assess(elevation, specialist)}
 
     def why(x: float, y: float, tau_low: float = 1e3, f_min: float = 0.1) -> str:
-        taus = {"steps": (tau_low, 10 * tau_low)}
-        return why_blocked(
-            x, y, elevation=elevation, assessments=assessments, taus=taus, f_min=f_min
-        )
+        assessment = assess(elevation, specialist, taus=(tau_low, 10 * tau_low))
+        return why_blocked(x, y, {"steps": assessment}, f_min=f_min)
 
+    with pytest.raises(ConfigError, match="without an assessment"):
+        why_blocked(0.5, 0.5, {})
     assert "off the map" in why(-1.0, 0.2)
     assert "never observed" in why(0.45, 0.35)
     assert "is open: steps leaves it towards" in why(0.65, 0.65)
@@ -284,7 +285,7 @@ def test_why_blocked_shows_places_to_the_cell_far_from_the_origin(make_specialis
     assessments = {"steps": assess(elevation, make_specialist("steps"))}
     for dx, dy in ((0.45, 0.35), (0.65, 0.65), (-0.05, 0.35)):
         x, y = origin[0] + dx, origin[1] + dy
-        reason = why_blocked(x, y, elevation=elevation, assessments=assessments)
+        reason = why_blocked(x, y, assessments)
         assert f"({x:.2f}, {y:.2f}) m" in reason
 
 
@@ -300,12 +301,12 @@ def test_a_bar_and_the_expected_time_are_shown_where_asked(make_specialist, monk
     monkeypatch.setattr(tensorization, "STRIP_CELLS", 50)
     for name in ("QUICK", "TRIED", "LONG"):
         monkeypatch.setattr(progress, name, 0.0)
-    tensorize_all(rough(15, 20), team)
+    assess_all(rough(15, 20), team)
     assert not capsys.readouterr().err
-    tensorize_all(rough(15, 20), team, progress=True)
+    assess_all(rough(15, 20), team, progress=True)
     shown = capsys.readouterr().err
     assert re.search("assessing 15 x 20 cells for 2 policies: about [0-9]+ s\n", shown)
-    # Two rows a strip are 8 strips; with 8 headings and two grids 128 tiles.
+    # Two rows per strip are 8 strips; with 8 headings and two grids 128 tiles.
     assert "128/128" in shown
 
 
@@ -319,5 +320,5 @@ def test_why_blocked_sees_a_cell_walled_in_by_unknown_ones(make_specialist):
     heights[2, 2] = heights[0, 0] = 0.0
     elevation = ElevationMap(heights)
     assessments = {"steps": assess(elevation, make_specialist())}
-    reason = why_blocked(0.25, 0.25, elevation=elevation, assessments=assessments)
+    reason = why_blocked(0.25, 0.25, assessments)
     assert "all its neighbours are unknown" in reason

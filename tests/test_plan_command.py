@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from fgtutor import patches, pipeline
+from fgtutor import patches, planning
 from fgtutor.cli.plan import PlanConfig, choose, run
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import (
@@ -18,8 +18,7 @@ from fgtutor.errors import (
     UnknownCellError,
 )
 from fgtutor.io import progress
-from fgtutor.pipeline import plan_on_map
-from fgtutor.planning import Route
+from fgtutor.planning import PAPER, Refusal, Route, plan_on_map
 from fgtutor.specialist import save_specialist
 
 
@@ -53,7 +52,7 @@ def test_the_command_plans_and_writes_the_route(case, tmp_path, capsys):
 def test_every_stage_is_kept(case, make_rolling):
     zoo = {"a": make_rolling("a", f=0.4), "b": make_rolling("b", f=0.6)}
     elevation = ElevationMap.load(case["map"])
-    plan = plan_on_map(elevation, zoo, case["start"], case["goal"], taus="paper")
+    plan = plan_on_map(elevation, zoo, case["start"], case["goal"], settings=PAPER)
     assert plan.names == ("a", "b") and len(plan.tensors) == 2
     assert torch.equal(plan.fused, torch.maximum(*plan.tensors))
     assert plan.route.choices.shape == (20, 2)
@@ -65,7 +64,8 @@ def test_tensors_already_computed_are_used(case, make_rolling):
     plan = plan_on_map(
         elevation, {"a": make_rolling("a")}, case["start"], case["goal"], tensors={"a": ones}
     )
-    assert plan.tensors[0] is ones and plan.route.cost == pytest.approx(20.0)
+    assert plan.tensors[0] is ones and plan.weights == {}
+    assert plan.route.cost == pytest.approx(0.1 * (18 + 2 * math.sqrt(2)))
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,6 @@ def test_bad_requests_say_which_and_what_to_do(case, change, error, message):
     ("change", "error"),
     [
         ({"start": (9.0, 1.0)}, OffMapError),
-        ({"goal": (1.55, 1.05)}, UnknownCellError),
         ({"goal": "there"}, ConfigError),
         ({"f_min": -1.0}, ConfigError),
         ({"backend": "astar"}, ConfigError),
@@ -109,10 +108,21 @@ def test_what_cannot_work_is_refused_before_the_map_is_tensorized(
         plan_on_map(ElevationMap.load(case["map"]), {"a": make_rolling("a")}, **arguments)
 
 
+def test_an_end_never_observed_is_refused_before_the_map_is_tensorized(
+    case, make_rolling, monkeypatch
+):
+    monkeypatch.setattr(patches, "prepare", None)
+    arguments = {"start": case["start"], "goal": (1.55, 1.05)}
+    plan = plan_on_map(ElevationMap.load(case["map"]), {"a": make_rolling("a")}, **arguments)
+    assert isinstance(plan.answer, Refusal) and isinstance(plan.answer.error, UnknownCellError)
+    with pytest.raises(UnknownCellError):
+        plan.route  # noqa: B018
+
+
 def test_a_long_plan_says_how_long(case, monkeypatch, capsys):
     for name in ("QUICK", "TRIED", "LONG"):
         monkeypatch.setattr(progress, name, 0.0)
-    monkeypatch.setattr(pipeline, "QUICK", 0.0)
+    monkeypatch.setattr(planning, "QUICK", 0.0)
     assert run(PlanConfig(**case)) == 0
     shown = capsys.readouterr()
     assert "assessing 30 x 20 cells for 2 policies: about" in shown.err
