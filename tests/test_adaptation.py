@@ -214,13 +214,6 @@ def test_the_command_drives_reports_and_resumes(config, capsys, monkeypatch):
     assert again == printed[printed.index("| checkpoint") :]  # the same, and nothing to do
 
 
-def test_a_part_waits_for_the_others(config, capsys, monkeypatch):
-    monkeypatch.setattr(adaptation, "run_task", lambda *_: pytest.fail("of another part"))
-    run(replace(config, trials=1, maps=1, part=(2, 2)))
-    assert "0 of 1 tasks done" in capsys.readouterr().out
-    assert not (config.out / "table.md").exists()
-
-
 def test_trials_are_spread_over_the_maps():
     config = AdaptationConfig(trials=5, maps=2, seed=1)
     first = 2 * 1_000_000 + 1

@@ -66,25 +66,16 @@ def test_the_number_of_workers_changes_nothing(config, monkeypatch):
 
 
 @pytest.mark.slow
-def test_parts_merge_to_the_same_table(config, monkeypatch):
-    monkeypatch.setattr(success, "GROUNDS", 1)
-    config = replace(config, trials=2, terrains=("flat",), policies=("steps",))
-    whole = evaluate(config)
-    parts = [replace(config, out=config.zoo.parent / f"part{k}", part=(k, 2)) for k in (1, 2)]
-    for part in parts:
-        with pytest.raises(ReportError, match=r"1 of 2 tasks done.*merge"):
-            evaluate(part)
-    merged = replace(config, merge=tuple(part.out for part in parts))
-    drawn = []
-    monkeypatch.setattr(success, "make_ground", lambda *which: drawn.append(which))
-    assert evaluate(merged) == whole and not drawn  # nothing is driven again
-    with pytest.raises(ReportError, match=r"f_min was 0\.1 and is 0\.2"):
-        evaluate(replace(merged, f_min=0.2))
-    # Another zoo is another run, wherever it lies.
+def test_another_zoo_and_other_settings_are_another_run(config):
+    config = replace(config, trials=1, terrains=("flat",), policies=("steps",))
+    config = replace(config, out=config.zoo.parent / "out")
+    evaluate(config)
+    with pytest.raises(ReportError, match=r"f_min was .* and is 0\.2"):
+        evaluate(replace(config, f_min=0.2))
     description = config.zoo / "steps" / "specialist.json"
     description.write_text(description.read_text() + "\n")
     with pytest.raises(ReportError, match="zoo was"):
-        evaluate(merged)
+        evaluate(config)
 
 
 @pytest.mark.slow
@@ -132,16 +123,6 @@ def test_the_command_writes_rows_and_a_report_and_prints_a_table(config, capsys)
     assert run(config) == 0
     again = capsys.readouterr().out
     assert line in again and "tasks to do" not in again
-
-
-def test_a_part_says_how_to_get_the_table(config, capsys, monkeypatch):
-    monkeypatch.setattr(success, "GROUNDS", 2)
-    part = replace(
-        config, terrains=("flat",), policies=("gaps",), out=config.zoo.parent / "a", part=(2, 2)
-    )
-    assert run(part) == 0
-    assert "1 of 2 tasks done" in (printed := capsys.readouterr().out) and "--merge" in printed
-    assert not (part.out / "table.md").exists()
 
 
 def test_evaluation_never_draws_a_training_seed():

@@ -27,7 +27,7 @@ def folder(tmp_path):
     )
     write_report(
         tmp_path / "report",
-        Run(tasks=2, results=results),
+        Run(results),
         Findings(
             table="| a |\n| --- |\n| 100 |",
             caption="Three trials a cell.",

@@ -47,7 +47,7 @@ ROWS = [{"x": x, "square": x * x, "seed": 0} for x in range(4)]
 def test_a_finished_task_is_not_done_again(tmp_path, diary):
     config = SquareConfig(out=tmp_path / "out")
     first = squares(config, diary)
-    assert first.rows == ROWS and first.complete and diary.read_text() == "0 1 2 3 "
+    assert first.rows == ROWS and diary.read_text() == "0 1 2 3 "
     again = squares(config, diary)
     assert again.rows == ROWS and diary.read_text() == "0 1 2 3 "
     assert again.seconds == first.seconds  # what the tasks took, not what reading them takes
@@ -89,26 +89,12 @@ def test_a_full_disk_says_so_and_keeps_the_shards_before(tmp_path, diary, monkey
     assert squares(config, diary).rows == ROWS
 
 
-def test_parts_of_several_machines_merge_to_the_same_rows(tmp_path, diary):
-    parts = [SquareConfig(out=tmp_path / f"part{k}", part=(k, 2)) for k in (1, 2)]
-    runs = [squares(part, diary) for part in parts]
-    assert [run.complete for run in runs] == [False, False] and "2 of 4 tasks" in repr(runs[0])
-    assert diary.read_text() == "0 2 1 3 "
-    merged = SquareConfig(out=tmp_path / "all", merge=(parts[0].out, parts[1].out))
-    assert squares(merged, diary).rows == ROWS
-    assert diary.read_text() == "0 2 1 3 "
-    # The merged folder is whole by itself.
-    assert squares(SquareConfig(out=tmp_path / "all"), diary).rows == ROWS
-    assert diary.read_text() == "0 2 1 3 "
-
-
-@pytest.mark.parametrize("place", ["out", "merge"])
-def test_a_folder_of_other_settings_is_refused(tmp_path, diary, place):
+def test_a_folder_of_other_settings_is_refused(tmp_path, diary):
     squares(SquareConfig(out=tmp_path / "out"), diary)
-    where = {"out": tmp_path / "out"} if place == "out" else {"merge": (tmp_path / "out",)}
     with pytest.raises(ReportError, match="seed was 0 and is 1"):
-        squares(SquareConfig(seed=1, **where), diary)
-    assert squares(SquareConfig(**where, zoo=tmp_path, workers=2), diary).rows == ROWS
+        squares(SquareConfig(seed=1, out=tmp_path / "out"), diary)
+    again = SquareConfig(out=tmp_path / "out", zoo=tmp_path, workers=2)
+    assert squares(again, diary).rows == ROWS
 
 
 def test_a_shard_of_other_settings_is_refused(tmp_path, diary):
@@ -149,8 +135,6 @@ def test_a_folder_of_something_else_is_refused(tmp_path, diary):
     (tmp_path / "photos" / "cat.png").touch()
     with pytest.raises(ReportError, match="not a report folder"):
         squares(SquareConfig(out=tmp_path / "photos"), diary)
-    with pytest.raises(ReportError, match="not a report folder"):
-        squares(SquareConfig(merge=(tmp_path / "missing",)), diary)
     for text in ("[1]", "[" * 100_000, '{"a": ', "\udcff"):
         bad = tmp_path / "photos" / "settings.json"
         bad.write_bytes(text.encode("utf-8", "surrogateescape"))
@@ -162,7 +146,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path, diary):
     assert "\x1b" not in str(caught.value) and len(str(caught.value)) < 3000
     assert diary.read_text() == ""  # refused before the work
     (tmp_path / "empty").mkdir()
-    assert squares(SquareConfig(out=tmp_path / "empty"), diary).complete
+    assert squares(SquareConfig(out=tmp_path / "empty"), diary).rows == ROWS
 
 
 def test_settings_are_what_the_rows_depend_on(tmp_path):
@@ -174,28 +158,7 @@ def test_settings_are_what_the_rows_depend_on(tmp_path):
     assert json.loads(json.dumps(settings)) == settings
 
 
-@pytest.mark.parametrize("part", [(0, 2), (3, 2), (1, 0)])
-def test_impossible_parts_are_refused(tmp_path, part):
-    with pytest.raises(ConfigError, match="part"):
-        RunConfig(out=tmp_path, part=part)
-
-
-def test_a_part_needs_a_folder():
-    with pytest.raises(ConfigError, match="--out"):
-        RunConfig(part=(1, 2))
-    with pytest.raises(ConfigError, match="workers"):
-        RunConfig(workers=-1)
-
-
-@pytest.mark.parametrize(
-    ("fields", "says"),
-    [
-        ({"workers": -1}, "workers: "),
-        ({"workers": 1.5}, "workers: "),
-        ({"part": (0, 2)}, "part: 0: "),
-        ({"part": (3, 2)}, "no part 3 of 2"),
-    ],
-)
-def test_a_run_that_cannot_be_is_refused(tmp_path, fields, says):
-    with pytest.raises(ConfigError, match=says):
-        RunConfig(out=tmp_path, **fields)
+@pytest.mark.parametrize("workers", [-1, 1.5])
+def test_a_run_that_cannot_be_is_refused(workers):
+    with pytest.raises(ConfigError, match="workers: "):
+        RunConfig(workers=workers)

@@ -355,16 +355,6 @@ def test_more_seeds_and_values_in_the_same_folder_train_only_the_new(config, mon
 
 
 @pytest.mark.slow
-def test_parts_merge_to_the_same_rows(whole, config, tmp_path, capsys):
-    parts = [replace(config, out=tmp_path / f"part{k}", part=(k, 2)) for k in (1, 2)]
-    for part in parts:
-        assert sweep.run(part) == 0
-    assert "1 of 2 tasks done" in capsys.readouterr().out
-    assert sweep.run(replace(config, merge=tuple(part.folder for part in parts))) == 0
-    assert (config.folder / "rows.json").read_bytes() == (whole / "rows.json").read_bytes()
-
-
-@pytest.mark.slow
 def test_a_generalist_crosses_every_kind(config):
     config = replace(config, terrains=("general",), seeds=(1,), trials=5)
     ((_, result),) = run_tasks(make_tasks(trainings(config), config.trials), workers=1)

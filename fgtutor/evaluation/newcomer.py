@@ -16,8 +16,8 @@ from typing import Annotated
 from fgtutor.baselines import AssessedMap, Layers, ours
 from fgtutor.errors import ConfigError, EvaluationError
 from fgtutor.evaluation import success
-from fgtutor.evaluation.provenance import digest
 from fgtutor.evaluation.report import markdown
+from fgtutor.evaluation.shards import digest
 from fgtutor.evaluation.success import TrialsConfig, by_cell, make_ground, summarise
 from fgtutor.evaluation.tasks import Row
 from fgtutor.evaluation.trials import drive

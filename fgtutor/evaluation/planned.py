@@ -7,8 +7,7 @@ Source: paper, Sec. III-B (taus) and III-C (edge cost, f_min).
 from dataclasses import dataclass
 from pathlib import Path
 
-from fgtutor.evaluation.provenance import digest
-from fgtutor.evaluation.shards import RunConfig
+from fgtutor.evaluation.shards import RunConfig, digest
 from fgtutor.io.validation import Seed
 from fgtutor.settings import PlanOptions
 from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo

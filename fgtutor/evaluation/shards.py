@@ -154,7 +154,7 @@ def _shard(folder: Path, task: Task) -> Path:
 
 
 def _check(folder: Path, settings: dict[str, Any]) -> None:
-    """Raise `ReportError` unless the folder is this run's, or empty, so that one may begin in it."""
+    """Raise `ReportError` unless the folder is empty or holds a run with these settings."""
     if folder.is_dir() and all(path.name == LOCK for path in folder.iterdir()):
         return
     try:

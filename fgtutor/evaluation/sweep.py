@@ -28,9 +28,8 @@ from fgtutor.errors import ConfigError, EvaluationError, FgtutorError, Specialis
 from fgtutor.evaluation import calibration, report
 from fgtutor.evaluation.calibration import CalibrationConfig
 from fgtutor.evaluation.cost import on_cores
-from fgtutor.evaluation.provenance import digest
 from fgtutor.evaluation.report import Findings, markdown
-from fgtutor.evaluation.shards import RunConfig, part_of, settings_of
+from fgtutor.evaluation.shards import RunConfig, digest, settings_of
 from fgtutor.evaluation.success import TrialsConfig, by_cell, cut, make_ground
 from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.evaluation.trials import drive
@@ -342,7 +341,7 @@ def run(config: SweepConfig) -> int:
         settings=settings,
         cost=partial(estimate, works),
         find=find,
-        watched=_watched([work.config for work in part_of(works, config)]),
+        watched=_watched([work.config for work in works]),
     )
 
 

@@ -179,34 +179,30 @@ print("the same rows:", results[1].rows == results[2].rows)
 # has to load torch, which for so short a job is most of the work. For an hour of it, it is
 # nothing.
 #
-# ## Stopped, and shared
+# ## Stopped, and gone on
 #
 # Give a run a folder, and each task's rows are kept there as soon as it is finished. Stop it, pull
-# the plug: the same command goes on. And *parts* of a run may be done anywhere. Here two "machines"
-# do half each, and a third only collects:
+# the plug: the same command goes on. Here the first task is all that was done before:
 
 # %%
-halves = [replace(small, workers=1, out=Path(f"part{i}"), part=(i, 2)) for i in (1, 2)]
-for half in halves:
-    print(collect(tasks, settings_of(half, "lesson"), half))
-
-# %%
-whole = replace(small, workers=1, out=Path("whole"), merge=(Path("part1"), Path("part2")))
+kept = replace(small, workers=1, out=Path("kept"))
+settings = settings_of(kept, "lesson")
+collect(tasks[:1], settings, kept)
 began = time.perf_counter()
-merged = collect(tasks, settings_of(whole, "lesson"), whole)
-print(f"merged in {time.perf_counter() - began:.2f} s; complete: {merged.complete}")
-print("the same rows again:", merged.rows == results[1].rows)
+whole = collect(tasks, settings, kept)
+print(f"gone on in {time.perf_counter() - began:.2f} s, {len(tasks) - 1} of {len(tasks)} tasks")
+print("the same rows again:", whole.rows == results[1].rows)
 
 # %%
 from fgtutor.figures.charts import draw_rates
 from fgtutor.statistics import Share
 
 by_policy = {
-    name: Share.of(row["outcome"] == "reached" for row in merged.rows if row["policy"] == name)
+    name: Share.of(row["outcome"] == "reached" for row in whole.rows if row["policy"] == name)
     for name in who
 }
 draw_rates({name: (s.successes, s.trials) for name, s in by_policy.items()},
-           title="However it was shared, this is what came out")  # fmt: skip
+           title="However it was done, this is what came out")  # fmt: skip
 
 # %% [markdown]
 # The same on a **Ray cluster**, of which this package needs to know nothing but the address (in a
