@@ -21,9 +21,9 @@ from fgtutor.io.validation import Count, CountOrZero, NonNegative, Seed, Share, 
 from fgtutor.learning.ppo import FeasibilityPPO
 from fgtutor.policies.dreamwaq import HISTORY, DreamWaQModel
 from fgtutor.policies.symmetry import SymmetricMLPModel
-from fgtutor.robots import env_class
+from fgtutor.robots import ROBOTS, env_class
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.world.terrain import SCALES, World, make_terrain
+from fgtutor.world.terrain import World, make_terrain
 
 Robots = Annotated[int, Interval(ge=1, le=100_000)]
 """Robots, or steps of one: as many as memory may hold."""
@@ -193,7 +193,7 @@ def training_world(config: TrainConfig, iteration: int = 0) -> World:
     `general` takes the robot's specialties in turn, column by column. Seeds are even here, and odd
     wherever terrain is evaluated, so nothing is ever evaluated on terrain trained on.
     """
-    mixed = SCALES[config.robot].mixed
+    mixed = ROBOTS[config.robot].scale.mixed
     names = mixed if config.terrain == "general" else (config.terrain,)
     levels = np.linspace(config.easiest, 1.0, config.rows) if config.rows > 1 else np.ones(1)
     rng = np.random.default_rng((config.seed, iteration))
