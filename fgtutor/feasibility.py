@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from annotated_types import Interval
 from jaxtyping import Bool, Float
+from rsl_rl.modules import MLP
 from torch import Tensor, nn
 
 from fgtutor.errors import ThresholdError
@@ -96,11 +97,10 @@ class FeasibilityNet(nn.Module):
         self.num_points, self.command_dim = num_points, command_dim
         self.hidden, self.vae_hidden = tuple(hidden), tuple(vae_hidden)
         self.latent, self.height_scale = latent, height_scale
-        wide, narrow = self.vae_hidden
-        self.head = _mlp(nn.ELU, num_points + command_dim, hidden[0], hidden[1], 1)
+        self.head = MLP(num_points + command_dim, 1, hidden, "elu")
         # tanh saturates: unlike ELU it cannot extrapolate to terrain steeper than any it has seen.
-        self.encoder = _mlp(nn.Tanh, num_points, wide, narrow, 2 * latent)
-        self.decoder = _mlp(nn.Tanh, latent, narrow, wide, num_points)
+        self.encoder = MLP(num_points, 2 * latent, vae_hidden, "tanh")
+        self.decoder = MLP(latent, num_points, vae_hidden[::-1], "tanh")
 
     def feasibility(
         self, patch: Float[Tensor, "*batch points"], command: Float[Tensor, "*batch command"]
@@ -169,9 +169,7 @@ def ood_weight(
             "raise tau_high or lower tau_low"
         )
     weight = 1 - (loss - tau_low) / (tau_high - tau_low)
-    if isinstance(weight, Tensor):
-        return weight.clamp(0, 1)
-    if isinstance(weight, np.ndarray):
+    if isinstance(weight, Tensor | np.ndarray):
         return weight.clip(0, 1)
     return min(max(float(weight), 0.0), 1.0)
 
@@ -187,27 +185,11 @@ def calibrated_taus(quantiles: Mapping[str, float]) -> tuple[float, float]:
     """
     try:
         low, high = float(quantiles["0.9"]), float(quantiles["0.99"])
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ThresholdError(
-            f'calibrated taus need the quantiles "0.9" and "0.99" of L_recon, got '
-            f'{dict(quantiles)}: train the specialist again, or use taus="paper"'
-        ) from error
+    except (KeyError, TypeError, ValueError, OverflowError):
+        low = high = math.nan
     if not (0 < low < high and 2 * high < math.inf):
         raise ThresholdError(
-            f"quantiles of L_recon must be positive and increasing, got q90 = {low}, q99 = {high}: "
-            'train the specialist again, or use taus="paper"'
+            'calibrated taus need positive, increasing quantiles "0.9" and "0.99" of L_recon, got '
+            f'{dict(quantiles)}: train the specialist again, or use taus="paper"'
         )
     return low, 2 * high
-
-
-def _mlp(
-    activation: type[nn.Module], inputs: int, first: int, second: int, outputs: int
-) -> nn.Sequential:
-    """Build linear - activation - linear - activation - linear."""
-    return nn.Sequential(
-        nn.Linear(inputs, first),
-        activation(),
-        nn.Linear(first, second),
-        activation(),
-        nn.Linear(second, outputs),
-    )

@@ -83,7 +83,7 @@ def test_outputs_have_the_shape_of_the_batch(net, batch):
 
 
 def test_reconstruction_is_a_sum_over_points(blank):
-    # Reconstructing zeros: 6 points of 0.5 m are 6 * 0.25 = 1.5 m^2, not their mean 0.25.
+    # Reconstructing zeros: 6 points of 0.5 m at scale 1 are 6 * 0.25 = 1.5, not their mean 0.25.
     assert blank.reconstruction(torch.full((POINTS,), 0.5)).item() == pytest.approx(1.5)
 
 

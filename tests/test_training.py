@@ -12,15 +12,10 @@ import torch
 
 from fgtutor.errors import CheckpointError, ConfigError, StorageError
 from fgtutor.feasibility import feasibility_labels
-from fgtutor.learning.trainer import read_checkpoint, write_checkpoint
-from fgtutor.learning.training import (
-    A1TrainConfig,
-    TrainConfig,
-    Trainer,
-    config_of,
-    train,
-    training_world,
-)
+from fgtutor.learning.checkpoints import read_checkpoint, write_checkpoint
+from fgtutor.learning.config import A1TrainConfig, TrainConfig, config_of, training_world
+from fgtutor.learning.trainer import Trainer
+from fgtutor.learning.training import train
 from fgtutor.specialist import load_specialist
 
 TINY = {

@@ -1,4 +1,4 @@
-"""A training run, one iteration at a time: robots, learner, curriculum, and its checkpoints.
+"""A training run, one iteration at a time: robots, learner, curriculum and checkpoints.
 
 Reads a `TrainConfig` and, to go on, a checkpoint; gives each iteration's numbers, checkpoints,
 snapshots and a `Specialist`. No data is collected for the Feasibility-Net alone: labels come from
@@ -142,11 +142,13 @@ class Trainer:
             with contextlib.redirect_stdout(io.StringIO()):  # what rsl_rl says of its processes
                 self.runner.learn(1)
         except (RuntimeError, ValueError) as error:
-            self._check_weights()
-            if isinstance(error, ValueError):  # rsl_rl or MuJoCo met something that is no number
-                raise self._diverged(str(error).splitlines()[0]) from error
-            raise
-        self._check_weights()
+            strange = self._strange_weights()
+            if not strange and isinstance(error, RuntimeError):
+                raise
+            # A ValueError: rsl_rl or MuJoCo met something that is no number.
+            raise self._diverged(strange or str(error).splitlines()[0]) from error
+        if strange := self._strange_weights():
+            raise self._diverged(strange)
         self._limit_noise()
         self.iteration += 1
         self.seconds += time.monotonic() - began
@@ -167,11 +169,6 @@ class Trainer:
             raise self._diverged(f"{', '.join(strange)} not finite")
         self.history.append(row)
         return row
-
-    def _check_weights(self) -> None:
-        """Raise `DivergedError` if a weight of any network is not finite."""
-        if strange := self._strange_weights():
-            raise self._diverged(strange)
 
     def _strange_weights(self) -> str:
         """Say which network has weights that are not finite, if one has."""
@@ -283,12 +280,12 @@ class Trainer:
                 f"{distributed.processes()}: go on with as many, or use another --out"
             )
         try:
-            self._take_over(state, everyone[distributed.rank()])
+            self._restore(state, everyone[distributed.rank()])
         except Exception as error:  # of rsl_rl, torch and the robots, whatever is in the state
             raise foreign(path, error) from error
 
-    def _take_over(self, state: dict[str, Any], own: dict[str, Any]) -> None:
-        """Set everything to what a checkpoint holds, and to what it holds of this process."""
+    def _restore(self, state: dict[str, Any], own: dict[str, Any]) -> None:
+        """Restore all that a checkpoint holds; `own` is this process's part of it."""
         with warnings.catch_warnings(action="ignore"):  # torch warns of what it then refuses
             self.algorithm.load(state["algorithm"])
         if strange := self._strange_weights():

@@ -1,17 +1,16 @@
-"""Joint training: PPO for the policy, and its Feasibility-Net on the very same rollouts.
+"""Joint training of a policy and its Feasibility-Net, from first to last iteration.
 
-Reads a robot, a terrain name and a `TrainConfig`; gives a `Specialist` folder and, on the way,
-tensorboard curves and checkpoints to resume from (see `trainer`). A run folder serves one run, and
-one process at a time.
+Reads a `TrainConfig`; gives a `Specialist` folder and, on the way, tensorboard curves and
+checkpoints to resume from (see `trainer`). A run folder serves one run, and one process at a time.
 Source: paper, Sec. III-A and Fig. 2.
 """
 
-import contextlib
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -20,13 +19,13 @@ from tqdm import tqdm
 from fgtutor.errors import CheckpointError
 from fgtutor.io.storage import locked_folder, storage_error
 from fgtutor.learning import distributed
-from fgtutor.learning.config import A1TrainConfig, TrainConfig, config_of, training_world
+from fgtutor.learning.config import TrainConfig, config_of, training_world
 from fgtutor.learning.distributed import leads
 from fgtutor.learning.trainer import CHECKPOINT, Trainer
 from fgtutor.robots import env_class
 from fgtutor.specialist import Specialist, save_specialist
 
-__all__ = ["A1TrainConfig", "TrainConfig", "Trainer", "config_of", "run", "train", "training_world"]
+__all__ = ["TrainConfig", "Trainer", "config_of", "run", "train"]
 
 INTERRUPTED = 130
 """Exit code after a Ctrl-C, as shells report it."""
@@ -44,9 +43,8 @@ def train(
     learned; `config.resume` continues. `on_iteration` gets each iteration's numbers (the notebooks
     draw them).
 
-    A run that nobody attends has no bar, and Ctrl-C is not its own: it ends where it is and resumes
-    from its last checkpoint as if nothing had been. (A checkpoint moves the run to other ground, so
-    one that Ctrl-C asks for makes another run of it.)
+    An unattended run has no bar, and Ctrl-C ends it at once: it resumes from its last checkpoint.
+    (One more checkpoint would move it to other ground, and make another run of it.)
 
     Raises:
         ConfigError: The settings do not fit each other.
@@ -68,7 +66,7 @@ def _train(
     env_class(config.robot)  # an unknown robot or terrain fails before there is a folder
     training_world(replace(config, rows=1, columns=1))
     with (
-        locked_folder(config.folder) if leads() else contextlib.nullcontext(),
+        locked_folder(config.folder) if leads() else nullcontext(),
         distributed.leave_at_end(),
     ):
         if leads() and not config.resume and (config.folder / CHECKPOINT).exists():
@@ -99,32 +97,24 @@ def _train(
 def _iterate(
     trainer: Trainer, on_iteration: Callable[[dict[str, float]], None] | None, attended: bool
 ) -> bool:
-    """Train to the end, to the time limit or to a Ctrl-C, and leave a checkpoint.
-
-    Return whether it was a Ctrl-C.
-    """
+    """Train to the end, the time limit or a Ctrl-C; leave a checkpoint; tell if it was a Ctrl-C."""
     from torch.utils.tensorboard import SummaryWriter
 
     config, began = trainer.config, time.monotonic()
-    with (
-        SummaryWriter(str(config.folder / "tensorboard"))
-        if leads()
-        else contextlib.nullcontext() as writer,
-        tqdm(
-            total=config.iterations,
-            initial=trainer.iteration,
-            unit="it",
-            disable=not (attended and leads()),
-        ) as bar,
-        stop_on_interrupt() if attended else contextlib.nullcontext(lambda: False) as stopped,
-        _quiet_threads(),
-    ):
-        bar.set_description(f"{config.robot} {config.terrain}")
+    curves = SummaryWriter(str(config.folder / "tensorboard")) if leads() else None
+    bar = tqdm(
+        desc=f"{config.robot} {config.terrain}",
+        total=config.iterations,
+        initial=trainer.iteration,
+        unit="it",
+        disable=not (attended and leads()),
+    )
+    with curves or nullcontext(), bar, stop_on_interrupt(attended) as stopped, _quiet_threads():
         while trainer.iteration < config.iterations:
             row = trainer.iterate()
-            if writer:
+            if curves:
                 for name, value in row.items():
-                    writer.add_scalar(name, value, trainer.iteration)
+                    curves.add_scalar(name, value, trainer.iteration)
             bar.update()
             bar.set_postfix(
                 r_v=f"{row['r_v']:.2f}", row=f"{row['row']:.1f}", std=f"{row['std']:.2f}"
@@ -134,7 +124,7 @@ def _iterate(
             if trainer.iteration % config.save_every == 0:
                 trainer.save()
             late = config.hours > 0 and time.monotonic() - began > 3600 * config.hours
-            # One process must not stop while the others wait for its gradients.
+            # A process must not stop while another one waits for its gradients.
             if any(distributed.gather(stopped() or late)):
                 break
         if trainer.iteration != trainer.saved:
@@ -142,9 +132,9 @@ def _iterate(
         return stopped() and trainer.iteration < config.iterations
 
 
-@contextlib.contextmanager
+@contextmanager
 def _quiet_threads() -> Iterator[None]:
-    """Let threads not print an OSError: the curves' own says what the run's error then says too."""
+    """Let threads print no OSError: the run raises what stops tensorboard's thread as its own."""
     before = threading.excepthook
     threading.excepthook = lambda what: (
         None if isinstance(what.exc_value, OSError) else before(what)
@@ -155,11 +145,12 @@ def _quiet_threads() -> Iterator[None]:
         threading.excepthook = before
 
 
-@contextlib.contextmanager
-def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+@contextmanager
+def stop_on_interrupt(attended: bool = True) -> Iterator[Callable[[], bool]]:
     """Turn the first Ctrl-C into a request to stop after this iteration; the second one interrupts.
 
-    Outside the main thread, where signals cannot be handled, Ctrl-C keeps its usual meaning.
+    Unattended, and outside the main thread, where signals cannot be handled, Ctrl-C keeps its usual
+    meaning.
     """
     asked = False
 
@@ -169,11 +160,10 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked = True
 
-    try:
-        previous = signal.signal(signal.SIGINT, ask)
-    except ValueError:
+    if not (attended and threading.current_thread() is threading.main_thread()):
         yield lambda: False
         return
+    previous = signal.signal(signal.SIGINT, ask)
     try:
         yield lambda: asked
     finally:
