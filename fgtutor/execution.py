@@ -80,6 +80,8 @@ class Episode:
     """Distance driven in the plane, m."""
     seconds: float
     """Simulated time, s."""
+    robot: str
+    """The robot that drove."""
     body: Float[np.ndarray, "steps features"] | None = None
     """What a figure needs to draw the robot (see `LocomotionEnv.drawing`), if it was recorded."""
 
@@ -259,6 +261,7 @@ class _Drive:
                 policies=np.array([self.tracks[i].own[place] for place in policies[i]]),
                 length=float(np.hypot(*np.diff(np.array(poses[i])[:, :2], axis=0).T).sum()),
                 seconds=len(poses[i]) * self.env.control_dt,
+                robot=self.specialists[0].robot,
                 body=np.array(bodies[i]) if record_body else None,
             )
             for i in range(n)

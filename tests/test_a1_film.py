@@ -60,6 +60,7 @@ def episode() -> Episode:
         policies=(np.arange(steps) >= 50).astype(int),
         length=0.99,
         seconds=2.0,
+        robot="a1",
         body=np.hstack((poses[:, :3] + (10.0, 0.0, 0.0), joints)),
     )
 
@@ -152,11 +153,11 @@ def test_without_graphics_nothing_is_left(episode, terrain, route, monkeypatch, 
 
 
 @pytest.mark.parametrize("change", [{"poses": np.zeros((0, 4)), "body": np.zeros((0, 19))}, {}])
-def test_the_body_decides_whose_film_it_is(episode, terrain, route, change):
+def test_the_robot_decides_which_film_it_is(episode, terrain, route, change):
     if change:
         with pytest.raises(ConfigError, match="the a1's body at each of 0 steps"):
             videos.film_of(replace(episode, **change), terrain, route)
     else:
         assert type(videos.film_of(episode, terrain, route)) is A1Film
-        toy = replace(episode, body=episode.body[:, :9])
+        toy = replace(episode, robot="toy", body=episode.body[:, :9])
         assert type(videos.film_of(toy, terrain, route)) is videos.Film

@@ -47,6 +47,7 @@ def walk(stance) -> Episode:
         policies=np.zeros(steps, dtype=int),
         length=0.49,
         seconds=1.0,
+        robot="a1",
         body=np.hstack((poses[:, :3], np.tile(stance[3:], (steps, 1)))),
     )
 

@@ -72,7 +72,7 @@ def episode() -> Episode:
     policies = (np.arange(steps) >= 25).astype(int)
     return Episode(
         success=True, reason="reached", poses=poses, policies=policies, length=1.96, seconds=2.0,
-        body=body,
+        robot="toy", body=body,
     )  # fmt: skip
 
 

@@ -22,11 +22,11 @@ from PIL import Image, ImageDraw
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.execution import Episode
-from fgtutor.figures.a1_film import A1Film
 from fgtutor.figures.canvas import Panels
 from fgtutor.figures.films import FPS, INK, SKY, WIDTH, EpisodeFilm, MapView, font
 from fgtutor.io.storage import atomic_write
 from fgtutor.io.validation import Positive, check_arguments
+from fgtutor.robots import ROBOTS, load
 from fgtutor.robots.toy import CLIFF, ToyModel
 from fgtutor.routes import Route
 from fgtutor.world.terrain import Terrain
@@ -145,10 +145,16 @@ def ground_along(
 
 
 def film_of(episode: Episode, terrain: Terrain, route: Route) -> EpisodeFilm:
-    """Return the film of whichever robot drove; raises `ConfigError` if no body was recorded."""
-    body = episode.body
-    cls = A1Film if body is not None and body.shape[-1] == A1Film.features else Film
-    return cls(episode, terrain, route)
+    """Return the film of the robot that drove.
+
+    Raises `ConfigError` if its entry in `ROBOTS` names none, or no body was recorded.
+    """
+    film = ROBOTS[episode.robot].film
+    if film is None:
+        raise ConfigError(
+            f"the robot {episode.robot} has no film: name one in its entry of fgtutor.robots.ROBOTS"
+        )
+    return load(film)(episode, terrain, route)
 
 
 def frames(

@@ -7,7 +7,7 @@ never loads pymunk.
 
 import importlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fgtutor.errors import ConfigError
 from fgtutor.world.obstacles import TerrainScale
@@ -29,6 +29,8 @@ class Robot:
     """Sizes of the terrains made for it, and which of them its mixed terrain holds."""
     order: tuple[str, ...] = ()
     """What follows what on the course of `evaluate switching`; default: as in `scale.mixed`."""
+    film: str | None = None
+    """Module and class of its film (a subclass of `figures.films.EpisodeFilm`), if it has one."""
 
     @property
     def course(self) -> tuple[str, ...]:
@@ -61,12 +63,14 @@ ROBOTS = {
             mixed=("steps", "gaps", "slopes", "rubble"),
         ),
         order=("steps", "slopes", "steps", "gaps", "rubble", "steps"),
+        film="fgtutor.figures.videos:Film",
     ),
     "a1": Robot(
         env="fgtutor.robots.a1.env:A1Env",
         # The paper's steps of 5-15 cm, gaps of 15 cm, beam of 35 cm, walls of 50 degrees.
         scale=TerrainScale(),
         order=("steps", "valley", "steps", "gaps", "bridge", "steps"),  # the paper's
+        film="fgtutor.figures.a1_film:A1Film",
     ),
 }
 """The robots by name."""
@@ -76,5 +80,10 @@ def env_class(robot: str) -> "type[LocomotionEnv]":
     """Return a robot's environment class; raises `ConfigError` for an unknown robot."""
     if robot not in ROBOTS:
         raise ConfigError(f"unknown robot {robot!r}; choose one of {', '.join(sorted(ROBOTS))}")
-    module, name = ROBOTS[robot].env.split(":")
+    return load(ROBOTS[robot].env)
+
+
+def load(place: str) -> Any:
+    """Return what a "module:name" of an entry names."""
+    module, name = place.split(":")
     return getattr(importlib.import_module(module), name)

@@ -126,6 +126,7 @@ class Drive:
             policies=np.array(self._policies),
             length=float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()),
             seconds=len(poses) * self.env.control_dt,
+            robot=self.zoo[self.policy].robot,
             body=np.array(self._bodies),
         )
 
