@@ -2,15 +2,11 @@
 
 import importlib
 import importlib.metadata
-import os
-import subprocess
-import sys
 
 import pytest
 
 from fgtutor.cli import doctor
 from fgtutor.cli.doctor import DoctorConfig, Finding
-from fgtutor.robots import GL_BACKENDS
 from fgtutor.specialist import save_specialist
 
 
@@ -34,9 +30,9 @@ def test_a_sound_installation_has_nothing_broken(zoo, capsys):
 
 
 def test_versions_are_those_installed(zoo):
-    found = findings(zoo)
-    for name in doctor.ESSENTIAL:
-        assert found[name].value == importlib.metadata.version(name)
+    value = findings(zoo)["packages"].value
+    for name in ("torch", "mujoco", "pymunk", "rsl-rl-lib"):
+        assert f"{name} {importlib.metadata.version(name)}" in value
 
 
 def test_a_corrupt_specialist_is_broken_and_named(zoo, capsys):
@@ -63,7 +59,7 @@ def test_an_empty_zoo_is_broken(tmp_path, folder):
 @pytest.mark.parametrize(
     ("names", "what", "state"),
     [
-        (("pymunk",), "pymunk", "broken"),
+        (("pymunk",), "packages", "broken"),
         (("jupyterlab", "nbclient"), "extra lab", "note"),
         (("ray",), "extra cluster", "note"),
     ],
@@ -112,23 +108,10 @@ def test_a_gl_backend_that_does_not_exist_is_named_with_a_reason(monkeypatch):
     assert finding.state == "note" and "crayons" in finding.value and "MUJOCO_GL" in finding.fix
 
 
-@pytest.mark.slow
-def test_the_gl_probe_agrees_with_drawing_here(monkeypatch):
-    # Whatever this machine can do, the probe says of each backend what a drawing process says.
-    for backend in GL_BACKENDS.get(sys.platform, ()):
-        drawn = subprocess.run(
-            [sys.executable, "-c", doctor._RENDER],
-            env=os.environ | {"MUJOCO_GL": backend},
-            capture_output=True,
-            check=False,
-        )
-        reason = doctor.probe_gl(backend, 60.0)
-        assert (reason is None) == (drawn.returncode == 0)
-        assert reason is None or reason
-
-
-def test_a_gl_backend_that_hangs_is_given_up():
-    assert doctor.probe_gl("egl", 1e-3) == "no picture within 0.001 s"
+def test_a_gl_backend_that_hangs_is_given_up(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    [finding] = [f for f in doctor.examine(DoctorConfig(gl_seconds=1e-3)) if f.what == "gl"]
+    assert finding.state == "note" and "no picture within 0.001 s" in finding.value
 
 
 def test_the_table_lines_up_and_lists_what_to_do():

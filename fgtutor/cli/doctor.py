@@ -8,6 +8,7 @@ import importlib
 import importlib.metadata
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import psutil
 from annotated_types import Interval
 
 from fgtutor import __version__
@@ -23,47 +25,25 @@ from fgtutor.errors import FgtutorError
 from fgtutor.io.machine import usable_cores
 from fgtutor.io.progress import waiting
 from fgtutor.io.validation import check_fields
-from fgtutor.robots import GL_BACKENDS
 
-ESSENTIAL = (
-    "torch",
-    "tensordict",
-    "rsl-rl-lib",
-    "pymunk",
-    "mujoco",
-    "numpy",
-    "scipy",
-    "networkx",
-    "safetensors",
-    "matplotlib",
-    "tyro",
-)
-"""Packages without which the toy pipeline or the A1 does not run."""
-EXTRAS = {
-    "lab": (
-        "the notebooks",
-        ("jupyterlab", "ipywidgets", "anywidget", "ipykernel", "jupytext", "nbclient"),
-    ),
-    "cluster": ("evaluations and sweeps on a Ray cluster", ("ray",)),
-}
-"""What each extra is for, and its packages: `pip install 'fgtutor[lab]'`."""
 INSTALL = "pip install --constraint constraints.txt --editable"
 """Said in the clone of fgtutor, this installs what is missing."""
 LOW_DISK, LOW_MEMORY = 2.0, 4.0
 """Below these many GB a training's checkpoints, or two trainings side by side, may not fit."""
 
-_RENDER = (
-    "import mujoco\n"
-    'scene = \'<mujoco><worldbody><light/><geom size=".1" rgba="1 0 0 1"/></worldbody></mujoco>\'\n'
-    "model = mujoco.MjModel.from_xml_string(scene)\n"
-    "data = mujoco.MjData(model)\n"
-    "mujoco.mj_forward(model, data)\n"
-    "with mujoco.Renderer(model, 32, 32) as renderer:\n"
-    "    renderer.update_scene(data)\n"
-    "    picture = renderer.render()\n"
-    "if picture.max() == 0:\n"
-    "    raise SystemExit('the picture came out black')\n"
-)
+_DRAW = """
+import sys
+import mujoco
+from fgtutor.errors import RenderingError
+from fgtutor.robots.offscreen import CURE, Renderer
+scene = '<mujoco><worldbody><light/><geom size=".1" rgba="1 0 0 1"/></worldbody></mujoco>'
+model = mujoco.MjModel.from_xml_string(scene)
+try:
+    with Renderer(model, 32, 32, patience=float(sys.argv[1])) as renderer:
+        print(renderer.backend)
+except RenderingError as error:
+    sys.exit(str(error).removesuffix(f": {CURE}"))
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +61,7 @@ class DoctorConfig:
         check_fields(self)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Finding:
     """One row of the report."""
 
@@ -105,13 +85,11 @@ def run(config: DoctorConfig) -> int:
 
 def examine(config: DoctorConfig) -> Iterator[Finding]:
     """Look at everything, one finding at a time."""
-    yield Finding(what="fgtutor", value=__version__)
-    yield Finding(what="python", value=f"{platform.python_version()} on {platform.platform()}")
+    yield Finding("fgtutor", __version__)
+    yield Finding("python", f"{platform.python_version()} on {platform.platform()}")
     yield from _packages()
     yield from _torch()
-    yield _cores()
-    yield _memory()
-    yield _disk()
+    yield from _machine()
     if config.gl:
         yield _gl(config.gl_seconds)
     yield from _zoo(config.zoo)
@@ -126,21 +104,28 @@ def report(findings: list[Finding]) -> str:
     return "\n".join([*lines, "", "What to do:" if fixes else "Nothing to do.", *fixes])
 
 
+def requirements() -> dict[str, list[str]]:
+    """Return the packages that fgtutor needs (under ""), and those that each extra adds."""
+    needs: dict[str, list[str]] = {}
+    for line in importlib.metadata.requires("fgtutor") or ():
+        name, *extra = re.findall(r"^[\w.-]+|(?<=extra == .)\w+", line)
+        needs.setdefault("".join(extra), []).append(name)
+    return needs
+
+
 def _packages() -> Iterator[Finding]:
-    """Look up the versions of the packages, and which of each extra are there."""
-    for name in ESSENTIAL:
-        if found := _version(name):
-            yield Finding(what=name, value=found)
-        else:
-            yield Finding(what=name, value="not installed", state="broken", fix=f"{INSTALL} .")
-    for extra, (use, names) in EXTRAS.items():
-        what, found = f"extra {extra}", [f"{name} {v}" for name in names if (v := _version(name))]
-        if len(found) == len(names):
-            yield Finding(what=what, value=", ".join(found))
-        else:
-            absent = ", ".join(name for name in names if not _version(name))
-            fix = f"for {use}: {INSTALL} '.[{extra}]'"
-            yield Finding(what=what, value=f"without {absent}", state="note", fix=fix)
+    """Look up the versions of the packages, and of those of each extra."""
+    for extra, names in requirements().items():
+        what = f"extra {extra}" if extra else "packages"
+        versions = {name: _version(name) for name in names}
+        absent = ", ".join(name for name, version in versions.items() if not version)
+        if not absent:
+            found = ", ".join(f"{name} {version}" for name, version in versions.items())
+            yield Finding(what, found)
+        elif not extra:
+            yield Finding(what, f"without {absent}", "broken", f"{INSTALL} .")
+        elif extra != "dev":  # learners need none of it
+            yield Finding(what, f"without {absent}", "note", f"{INSTALL} '.[{extra}]'")
 
 
 def _version(package: str) -> str | None:
@@ -156,81 +141,42 @@ def _torch() -> Iterator[Finding]:
     try:
         torch = importlib.import_module("torch")
     except (ImportError, OSError) as error:
-        yield Finding(
-            what="import torch",
-            value=_last_line(str(error)),
-            state="broken",
-            fix="pip install --force-reinstall -c constraints.txt torch",
-        )
+        fix = "pip install --force-reinstall -c constraints.txt torch"
+        yield Finding("import torch", _last_line(str(error)), "broken", fix)
         return
     if torch.cuda.is_available():
-        yield Finding(what="gpu", value=torch.cuda.get_device_name())
+        yield Finding("gpu", torch.cuda.get_device_name())
     else:
-        yield Finding(what="gpu", value="none; none is needed")
+        yield Finding("gpu", "none; none is needed")
 
 
-def _cores() -> Finding:
-    return Finding(what="cores", value=f"{usable_cores()} usable of {os.cpu_count()}")
-
-
-def _memory() -> Finding:
-    if not hasattr(os, "sysconf"):
-        return Finding(what="memory", value="unknown on this system")
-    gigabytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    value = f"{gigabytes:.1f} GB"
-    if gigabytes >= LOW_MEMORY:
-        return Finding(what="memory", value=value)
-    return Finding(what="memory", value=value, state="note", fix="run one training at a time")
-
-
-def _disk() -> Finding:
-    gigabytes = shutil.disk_usage(Path.cwd()).free / 1e9
-    value = f"{gigabytes:.1f} GB free here"
-    if gigabytes >= LOW_DISK:
-        return Finding(what="disk", value=value)
-    return Finding(what="disk", value=value, state="note", fix="free space before you train")
+def _machine() -> Iterator[Finding]:
+    """Look at cores, memory and disk."""
+    yield Finding("cores", f"{usable_cores()} usable of {os.cpu_count()}")
+    memory, disk = psutil.virtual_memory().total / 1e9, shutil.disk_usage(Path.cwd()).free / 1e9
+    for what, has, least, fix in (
+        ("memory", memory, LOW_MEMORY, "run one training at a time"),
+        ("disk", disk, LOW_DISK, "free space before you train"),
+    ):
+        value = f"{has:.1f} GB{' free here' * (what == 'disk')}"
+        yield Finding(what, value) if has >= least else Finding(what, value, "note", fix)
 
 
 def _gl(seconds: float) -> Finding:
-    """Try the drawing backends, each in a process of its own: a bad one may abort the process."""
-    wanted = os.environ.get("MUJOCO_GL")
-    backends = (wanted,) if wanted else GL_BACKENDS.get(sys.platform, ())
-    refusals = []
-    for backend in backends:
-        reason = probe_gl(backend, seconds)
-        if reason is None:
-            fix = (
-                ""
-                if wanted or sys.platform != "linux"
-                else f"without a screen: export MUJOCO_GL={backend}"
-            )
-            return Finding(what="gl", value=f"MuJoCo draws with {backend}", fix=fix)
-        refusals.append(f"{backend}: {reason}")
-    return Finding(
-        what="gl",
-        value="; ".join(refusals) or "no backend is known for this system",
-        state="note",
-        fix="videos of the A1 need one (the toy needs none); on Debian or Ubuntu: "
-        "apt install libosmesa6, then export MUJOCO_GL=osmesa",
-    )
-
-
-def probe_gl(backend: str, seconds: float) -> str | None:
-    """Return why MuJoCo cannot draw with this backend, or None if it can."""
-    try:
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", _RENDER],
-            env={**os.environ, "MUJOCO_GL": backend},
-            capture_output=True,
-            text=True,
-            timeout=seconds,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return f"no picture within {seconds:g} s"
+    """Start what draws films, from a process of its own: a bad graphics library may abort it."""
+    command = [sys.executable, "-P", "-c", _DRAW, str(seconds)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode == 0:
-        return None
-    return _last_line(done.stderr) or f"ended with code {done.returncode}"
+        backend = done.stdout.strip()
+        told = os.environ.get("MUJOCO_GL") or sys.platform != "linux"
+        fix = "" if told else f"without a screen: export MUJOCO_GL={backend}"
+        return Finding("gl", f"MuJoCo draws with {backend}", fix=fix)
+    reason = _last_line(done.stderr) or f"drawing ended with code {done.returncode}"
+    fix = (
+        "videos of the A1 need it (the toy needs none); on Debian or Ubuntu: apt install "
+        "libosmesa6, then export MUJOCO_GL=osmesa"
+    )
+    return Finding("gl", reason, "note", fix)
 
 
 def _zoo(folder: Path) -> Iterator[Finding]:
@@ -238,27 +184,21 @@ def _zoo(folder: Path) -> Iterator[Finding]:
     try:
         load_specialist = importlib.import_module("fgtutor.specialist").load_specialist
     except (ImportError, OSError) as error:
-        yield Finding(
-            what="zoo", value=_last_line(str(error)), state="broken", fix="mend the packages above"
-        )
+        yield Finding("zoo", _last_line(str(error)), "broken", "mend the packages above")
         return
     # A hidden folder is what an interrupted save left; no reader looks at it.
     found = sorted(p.parent for p in folder.glob("*/[!.]*/specialist.json"))
     if not found:
-        yield Finding(
-            what="zoo",
-            value=f"no specialist in {folder}",
-            state="broken",
-            fix="restore the folder (git checkout), or train one: fgtutor train --help",
-        )
+        fix = "restore the folder (git checkout), or train one: fgtutor train --help"
+        yield Finding("zoo", f"no specialist in {folder}", "broken", fix)
     for path in found:
         what = f"zoo {path.parent.name}/{path.name}"
         try:
             specialist = load_specialist(path)
         except FgtutorError as error:
-            yield Finding(what=what, value="corrupt", state="broken", fix=str(error))
+            yield Finding(what, "corrupt", "broken", str(error))
         else:
-            yield Finding(what=what, value=repr(specialist))
+            yield Finding(what, repr(specialist))
 
 
 def _last_line(text: str) -> str:
