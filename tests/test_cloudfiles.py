@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from cloud_writers import FORMATS, cloud, las, pcd, written
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -150,7 +149,7 @@ def test_masked_rows_are_no_points() -> None:
     points = np.ma.masked_equal(np.array([[0, 0, 1], [1, 2, -9999], [0.01, 0, 1]]), -9999)
     read = cloud_of(points)
     assert read.points.tolist() == [[0, 0, 1], [0.01, 0, 1]]
-    assert read.notes == ("1 masked point",)
+    assert read.notes == ("1 point not finite",)
     scanned = map_points(points)
     assert scanned.count.sum() == 2 and scanned.elevation.heights[0, 0] == 1
 
@@ -165,11 +164,10 @@ def test_masked_rows_are_no_points() -> None:
         np.full((4, 3), "1"),
         [[1, 2, 3], [1, 2]],
         None,
-        torch.ones(4, 3, requires_grad=True),
     ],
 )
 def test_what_is_no_array_of_real_numbers_is_refused(points: object, tmp_path: Path) -> None:
-    with pytest.raises(CloudError, match="points must"):
+    with pytest.raises(CloudError, match=r"points (hold|is no array)"):
         map_points(points)  # pyright: ignore[reportArgumentType]
     if isinstance(points, np.ndarray) and points.dtype != object:
         np.savez(tmp_path / "cloud.npz", points=points)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fgtutor.errors import CloudError
+from fgtutor.io.validation import numbers
 
 Points = Float[np.ndarray, "n 3"]
 
@@ -37,7 +38,7 @@ class Cloud:
 
 
 def cloud_of(values: object, *, step: float = 0.0, notes: tuple[str, ...] = ()) -> Cloud:
-    """Return points [n, 3] as a cloud, without masked rows and rows that are not finite.
+    """Return points [n, 3] as a cloud, without rows that are masked or not finite.
 
     Args:
         values: The points, or a table with fields x, y and z, or a cloud: it is returned as it is.
@@ -49,35 +50,27 @@ def cloud_of(values: object, *, step: float = 0.0, notes: tuple[str, ...] = ()) 
     """
     if isinstance(values, Cloud):
         return values
-    try:
-        array = np.asanyarray(values)
-    except Exception as error:  # whatever a foreign type raises, such as a tensor with a gradient
-        kind = type(values).__name__
-        raise CloudError(f"points must be an array [n, 3], a {kind} gives none: {error}") from error
-    kinds = [array.dtype]
-    if array.dtype.names:
-        kinds = [array.dtype[axis] for axis in "xyz"]
-        array = np.stack([array[axis] for axis in "xyz"], axis=-1)
-    if array.dtype.kind not in "fiu":
-        raise CloudError(f"points must be real numbers in metres, got {array.dtype}")
+    table = getattr(getattr(values, "dtype", None), "names", None)
+    kinds = [values.dtype[axis] for axis in "xyz"] if table else []  # pyright: ignore
+    if table:
+        values = np.stack([values[axis] for axis in "xyz"], axis=-1)  # pyright: ignore
+    array = numbers("points", values, CloudError, unknown=True)
     if array.ndim != 2 or array.shape[1] != 3:
         raise CloudError(f"points must have shape [n, 3] (x, y, z in metres), got {array.shape}")
-    masked = np.asarray(np.ma.getmaskarray(array)).any(axis=1)
     with np.errstate(over="ignore", invalid="ignore"):
-        points = np.asarray(np.ma.getdata(array), dtype=np.float64)
+        points = array.astype(np.float64, copy=False)
     whole = np.isfinite(points).all(axis=1)
-    notes += note((~whole & ~masked).sum(), "point", " not finite")
-    notes += note(masked.sum(), "masked point")
-    whole &= ~masked
+    notes += note((~whole).sum(), "point", " not finite")
     if not whole.any():
         without = f" ({', '.join(notes)})" if notes else ""
         raise CloudError(
             f"none of the {len(points)} points is finite{without}: scan or export again"
         )
     points = points if whole.all() else points[whole]
-    kind = min((k for k in kinds if k.kind == "f" and k.itemsize < 8), default=None, key=str)
-    spacing = np.spacing((kind or points.dtype).type(max(points.max(), -points.min())))
-    return Cloud(points, max(step, float(spacing)), kind is not None, notes)
+    small = [kind for kind in kinds or [array.dtype] if kind.kind == "f" and kind.itemsize < 8]
+    coarsest = min(small, default=points.dtype, key=lambda kind: kind.itemsize)
+    spacing = np.spacing(coarsest.type(max(points.max(), -points.min())))
+    return Cloud(points, max(step, float(spacing)), bool(small), notes)
 
 
 def note(count: int, what: str, more: str = "") -> tuple[str, ...]:
