@@ -1,4 +1,4 @@
-"""Feasibility-Net: how well a policy would track its command here, and whether it knows the place.
+"""Feasibility-Net: how well a policy would track a command here, and how familiar the terrain is.
 
 Reads a patch H_xy (`patches.sample_patches`) and a velocity command; gives the feasibility f in
 [0, 1] and the reconstruction loss L_recon from which the weight w_ood follows. The labels that f

@@ -149,9 +149,8 @@ def save_specialist(specialist: Specialist, folder: str | Path) -> Path:
     # Compared with what a reader will build: a folder that cannot be loaded is never written.
     config, sizes = PolicyConfig.of(specialist.policy), _sizes_of(specialist.feasibility)
     payloads = {}
-    for file, module, twin in zip(
-        TENSORS, _networks(specialist), _build(config, sizes, "meta", where), strict=True
-    ):
+    twins = _build(config, sizes, "meta", where)
+    for file, module, twin in zip(TENSORS, _networks(specialist), twins, strict=True):
         state = {k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}
         check_tensors(twin, state, f"{where} {file}")
         payloads[file] = safetensors.torch.save(state)
@@ -195,20 +194,20 @@ def load_specialist(folder: str | Path) -> Specialist:
             f"no specialist folder {folder}: check the path, or train one with `fgtutor train`"
         )
     path = folder / DESCRIPTION
-    told = _read_description(path)
+    description = _read_description(path)
+    networks = description.policy, description.feasibility
     # Built without memory first: what the description claims may be larger than any machine.
+    twins = _build(*networks, "meta", str(path))
     tensors = [
-        read_tensors(folder / file, told.files[file], twin)
-        for file, twin in zip(
-            TENSORS, _build(told.policy, told.feasibility, "meta", str(path)), strict=True
-        )
+        read_tensors(folder / file, description.files[file], twin)
+        for file, twin in zip(TENSORS, twins, strict=True)
     ]
-    policy, feasibility = _build(told.policy, told.feasibility, "cpu", str(path))
+    policy, feasibility = _build(*networks, "cpu", str(path))
     try:
         specialist = Specialist(
             policy=policy,
             feasibility=feasibility,
-            **{name: getattr(told, name) for name in _PLAIN},
+            **{name: getattr(description, name) for name in _PLAIN},
         )
         for module, state in zip(_networks(specialist), tensors, strict=True):
             module.load_state_dict(state)
@@ -226,7 +225,7 @@ def load_zoo(
 ) -> dict[str, Specialist]:
     """Load every specialist of a robot, by name in alphabetical order; hidden folders are skipped.
 
-    `folder` holds one folder a specialist (default: the shipped zoo). The baseline `general` is
+    `folder` holds one folder per specialist (default: the shipped zoo). The baseline `general` is
     left out unless asked for.
 
     Raises:
@@ -267,7 +266,7 @@ def load_zoo(
 
 @dataclass(frozen=True, kw_only=True)
 class _Known:
-    """What is read of a provenance, which otherwise holds what its writer liked."""
+    """The entries of a provenance that are read; any other may stand beside them."""
 
     terrain: Name = ""
     samples: Annotated[int, Interval(ge=0, le=10**15)] = 0
@@ -330,11 +329,11 @@ def _read_description(path: Path) -> _Description:
     """Read `specialist.json`, verifying its schema version, its own checksum and every value."""
     payload = read_bytes(path, LARGEST_RECORD)
     try:
-        description = json.loads(payload)
-        if not isinstance(description, dict):
-            raise TypeError(f"expected an object, got a {type(description).__name__}")
-        schema, stored = description.get("schema"), description.get("checksum")
-        computed = _checksum(description)
+        content = json.loads(payload)
+        if not isinstance(content, dict):
+            raise TypeError(f"expected an object, got a {type(content).__name__}")
+        schema, stored = content.get("schema"), content.get("checksum")
+        computed = _checksum(content)
     except (ValueError, TypeError, RecursionError) as error:
         raise SpecialistError(f"cannot read {path} ({error}): {CURE}") from error
     if schema != SCHEMA:
@@ -344,10 +343,11 @@ def _read_description(path: Path) -> _Description:
         )
     if stored != computed:
         raise SpecialistError(f"{path} was altered, its checksum does not match: {CURE}")
-    told = parse_record(_Description, payload, SpecialistError, str(path))
-    if set(told.files) != set(TENSORS):
-        raise SpecialistError(f"{path} lists {str([*told.files])!r:.100}, not {TENSORS}: {CURE}")
-    return told
+    description = parse_record(_Description, payload, SpecialistError, str(path))
+    if set(description.files) != set(TENSORS):
+        found = str([*description.files])
+        raise SpecialistError(f"{path} lists {found!r:.100}, not {TENSORS}: {CURE}")
+    return description
 
 
 def _networks(specialist: Specialist) -> tuple[nn.Module, nn.Module]:
@@ -370,7 +370,7 @@ def _build(
     try:
         with torch.random.fork_rng(devices=[]), torch.device(device):
             return config.build(), FeasibilityNet(**vars(numbers))
-    except Exception as error:  # the class of a policy may be anybody's
+    except Exception as error:  # a registered class may raise anything
         raise SpecialistError(
             f"{where}: no policy can be built of this description ({str(error)!r:.300}): {CURE}"
         ) from error

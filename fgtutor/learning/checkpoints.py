@@ -1,4 +1,4 @@
-"""The file that a training goes on from: a sha256, then what torch saves.
+"""A training's checkpoint on disk: a sha256, then what torch saves.
 
 Reads and gives a dict of plain values, networks, optimisers and the robots' state; nothing but
 tensors and plain values is ever unpickled.

@@ -34,7 +34,7 @@ Widths = Annotated[tuple[Annotated[int, Interval(ge=1, le=4096)], ...], MinLen(1
 Seconds = Annotated[float, Interval(ge=0, le=60)]
 """A part of an episode, s."""
 Speed = Annotated[float, Interval(gt=0, le=10)]
-"""A speed at which a robot may be told to go, m/s."""
+"""A commanded speed, m/s."""
 Rate = Annotated[float, Interval(gt=0, le=1)]
 """A learning rate."""
 Std = Annotated[float, Interval(gt=0, le=2)]

@@ -1,9 +1,9 @@
-"""One training on several processes: which of them this is, how they are joined, what they share.
+"""Training on several processes (torchrun): ranks, seeds and devices, and what is exchanged.
 
-Reads the variables that torchrun sets; gives rsl_rl's runner on whatever processes there are. Each
-simulates robots of its own on ground of its own and keeps their curriculum to itself; gradients are
-averaged, so that all hold the same networks. With one process, everything here is the identity.
-Source: rsl_rl's `OnPolicyRunner`, whose own way this is, except that it insists on GPUs.
+Reads the variables that torchrun sets; gives rsl_rl's runner for these processes. Each simulates
+its own robots, with their curriculum, on its own ground; gradients are averaged, so that all hold
+the same networks. With one process, everything here is the identity.
+Source: rsl_rl's `OnPolicyRunner`, which does the same but insists on GPUs.
 """
 
 import contextlib

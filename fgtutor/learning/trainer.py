@@ -273,14 +273,14 @@ class Trainer:
             raise CheckpointError(
                 f"{path} belongs to another run: {what}. Use the same settings, or another --out"
             )
-        everyone = [state, *state["others"]]
-        if len(everyone) != distributed.processes():
+        parts = [state, *state["others"]]
+        if len(parts) != distributed.processes():
             raise CheckpointError(
-                f"{path} was written by {len(everyone)} processes, these are "
+                f"{path} was written by {len(parts)} processes, these are "
                 f"{distributed.processes()}: go on with as many, or use another --out"
             )
         try:
-            self._restore(state, everyone[distributed.rank()])
+            self._restore(state, parts[distributed.rank()])
         except Exception as error:  # of rsl_rl, torch and the robots, whatever is in the state
             raise foreign(path, error) from error
 

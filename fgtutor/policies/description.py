@@ -37,7 +37,7 @@ POLICIES: dict[str, type[MLPModel]] = {
 }
 """Policy classes that a folder may name; `register_policy` adds one."""
 Activation = Literal["elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu"]
-"""Activation functions that a folder may name; rsl_rl knows them by these words."""
+"""Activation functions that a folder may name, by rsl_rl's names."""
 
 
 def register_policy(name: str, cls: type[MLPModel]) -> None:
