@@ -185,12 +185,43 @@ def make_terrain(
         # To where no foot touches a neighbour; from where none does at rest, askew or not.
         start, goal = (x0 - 0.6 * landing, y), (x1 + 0.6 * landing, y)
         limits = (x0 - 0.7 * landing, x1 + 0.7 * landing)
+    return finish_course(
+        course,
+        name=name,
+        robot=robot,
+        seed=seed,
+        length=length,
+        start=start,
+        goal=goal,
+        sections=sections,
+        lane=lane,
+        limits=limits,
+    )
+
+
+def finish_course(
+    course: Course,
+    *,
+    name: str,
+    robot: str,
+    seed: int,
+    length: float,
+    start: Point,
+    goal: Point,
+    sections: Sequence[Section],
+    lane: Sequence[Point] = (),
+    limits: tuple[float, float] | None = None,
+) -> Terrain:
+    """Return the terrain that a course of `length` (m) makes, with the map of its boxes.
+
+    The lane leads from the start over the points given to the goal.
+    """
     return Terrain(
         name=name,
         robot=robot,
-        difficulty=difficulty,
+        difficulty=course.difficulty,
         seed=seed,
-        elevation=rasterise(course.boxes, (length, width), scale.resolution),
+        elevation=rasterise(course.boxes, (length, course.width), course.scale.resolution),
         boxes=tuple(course.boxes),
         start=start,
         goal=goal,
