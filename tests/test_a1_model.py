@@ -7,6 +7,7 @@ import pytest
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.robots.a1 import model as a1_model
+from fgtutor.robots.a1.looks import dress
 from fgtutor.world.terrain import Box, make_terrain
 
 SLICES = a1_model.sensor_slices()
@@ -165,7 +166,9 @@ def test_the_robot_never_collides_with_itself(model):
 
 
 def test_visuals_change_nothing_but_the_looks(model):
-    pretty = a1_model.build_spec(visuals=True).compile()
+    spec = a1_model.build_spec()
+    dress(spec)
+    pretty = spec.compile()
     assert pretty.ngeom > model.ngeom
     states = []
     for each in (model, pretty):

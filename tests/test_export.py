@@ -101,7 +101,8 @@ def test_a_blind_policy_reads_frames_without_velocity_and_scan(make_specialist, 
 def test_an_observation_can_be_built_from_the_description_alone(seeing):
     """Measure everything anew with MuJoCo and the map, and follow the description's words."""
     env, told = walk(), export.describe(seeing)
-    data = env.physics.data(0)
+    data = mujoco.MjData(env.physics.model)
+    data.qpos, data.qvel = env.physics.qpos[0], env.physics.qvel[0]
     to_trunk = np.zeros(9)
     mujoco.mju_quat2Mat(to_trunk, data.qpos[3:7])
     to_trunk = to_trunk.reshape(3, 3).T

@@ -44,10 +44,8 @@ def same(first, second, sims=slice(None)):
 def test_starts_at_the_keyframe(model):
     physics = Physics(model, SIMS, threads=1)
     assert physics.num_sims == SIMS
-    assert physics.threads == 1
     assert torch.equal(physics.qpos[3], torch.from_numpy(model.key_qpos[0]))
     assert torch.equal(physics.ctrl[3], torch.tensor(a1_model.STANCE, dtype=torch.float64))
-    assert "6 simulations on 1 threads" in repr(physics)
 
 
 def test_starts_at_the_defaults_without_a_keyframe():
@@ -93,7 +91,6 @@ def test_tensors_share_memory_with_the_simulator(model):
     qpos, height = physics.qpos, physics.derived("xpos")
     qpos[2, 2] = 1.75
     physics.forward()
-    assert physics.data(2).qpos[2] == 1.75
     assert height[2, model.body("trunk").id, 2] == 1.75
     physics.step(4)
     assert physics.qpos.data_ptr() == qpos.data_ptr()
@@ -127,7 +124,6 @@ def test_reset_touches_only_the_simulations_named(model):
     none = torch.tensor([], dtype=torch.long)
     physics.reset(none)
     physics.forward(none)
-    physics.set_const(none)
     assert torch.equal(physics.qpos[others], before[0][others])
 
 
@@ -172,7 +168,7 @@ def test_parameters_differ_between_simulations():
     physics = Physics(model, 3, threads=1)
     trunk = model.body("trunk").id
     physics.parameter("body_mass")[1, trunk] += 3.0
-    physics.set_const(torch.tensor([1]))
+    physics.set_const()
     for _ in range(100):
         physics.step(4)
     physics.forward()

@@ -28,6 +28,7 @@ from fgtutor.io.validation import (
     check_arguments,
     check_fields,
 )
+from fgtutor.robots.a1.looks import dress
 from fgtutor.robots.a1.model import STANCE, STANCE_HEIGHT, add_box, build_spec
 from fgtutor.world.terrain import Terrain, boxes_from_elevation
 
@@ -206,7 +207,8 @@ class _Scene:
         boxes = terrain.boxes or boxes_from_elevation(terrain.elevation)
         self.carried, self.farthest = config.carrier == "a1", config.reach[1]
         if self.carried:
-            spec = build_spec(boxes, visuals=True)
+            spec = build_spec(boxes)
+            dress(spec)
         else:
             spec = mujoco.MjSpec()
             for box in boxes:

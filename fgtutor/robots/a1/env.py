@@ -14,14 +14,12 @@ import math
 import warnings
 from dataclasses import fields
 
-import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import grey_closing, maximum_filter
 from torch import Tensor
 
-from fgtutor.elevation import ElevationMap
 from fgtutor.patches import PatchGrid, ground_height, rotate, sample_heights
 from fgtutor.robots.a1 import observation, rewards
 from fgtutor.robots.a1.model import (
@@ -29,16 +27,10 @@ from fgtutor.robots.a1.model import (
     STANCE,
     STANCE_HEIGHT,
     A1Config,
-    build_spec,
     sensor_slices,
+    world_spec,
 )
-from fgtutor.robots.a1.observation import (
-    NOISE,
-    SCAN_GRID,
-    SCAN_LIMIT,
-    SCAN_NOISE,
-    SCAN_SCALE,
-)
+from fgtutor.robots.a1.observation import NOISE, SCAN_GRID, SCAN_LIMIT, SCAN_NOISE, SCAN_SCALE
 from fgtutor.robots.a1.physics import Physics
 from fgtutor.robots.a1.randomise import A1EnvConfig, randomise
 from fgtutor.robots.base import Layout, LocomotionEnv
@@ -374,20 +366,6 @@ class A1Env(LocomotionEnv):
     def _feet(self, name: str) -> Float[Tensor, "envs 4 3"]:
         """Return a group of sensors, one vector a foot."""
         return self.sensed[:, self.sensors[name]].reshape(-1, 4, 3)
-
-
-def world_spec(world: World, model: A1Config) -> mujoco.MjSpec:
-    """Return the model of the world: boxes if its ground is made of blocks, else a height field."""
-    tiles = [tile for row in world.tiles for tile in row]
-    if all(tile.boxes or _blocky(tile.elevation) for tile in tiles):
-        return build_spec(world.boxes, config=model)
-    return build_spec(heightfield=world.elevation.filled(), config=model)
-
-
-def _blocky(elevation: ElevationMap) -> bool:
-    """Tell whether most neighbouring cells have equal heights, so that few boxes suffice."""
-    heights = np.asarray(elevation.filled().heights)
-    return all(float((np.diff(heights, axis=k) == 0).mean()) > 0.9 for k in (0, 1))
 
 
 def _edges(ground: Float[np.ndarray, "nx ny"]) -> Float[np.ndarray, "nx ny"]:

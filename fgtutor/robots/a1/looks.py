@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float
 
 from fgtutor.elevation import ElevationMap
-from fgtutor.robots.a1.env import world_spec
 from fgtutor.robots.a1.model import (
     CALF_LENGTH,
     FOOT_RADIUS,
@@ -26,6 +25,7 @@ from fgtutor.robots.a1.model import (
     THIGH_LENGTH,
     TRUNK_SIZE,
     A1Config,
+    world_spec,
 )
 from fgtutor.robots.offscreen import COAT
 from fgtutor.world.boxes import Box
@@ -82,7 +82,7 @@ def a1_scene(
     spec = world_spec(world, A1Config())
     _set_looks(spec, width, height)
     _lay_ground(spec, world)
-    _dress(spec)
+    dress(spec)
     ground = terrain.elevation.filled()
     _paint(spec, ground, np.asarray(xy, dtype=float), colours)
     _add_goal(spec, ground, np.asarray(xy, dtype=float)[-1], goal_radius)
@@ -150,8 +150,8 @@ def _lay_ground(spec: mujoco.MjSpec, world: World) -> None:
             geom.material, geom.rgba = "ground", (1.0, 1.0, 1.0, 1.0)
 
 
-def _dress(spec: mujoco.MjSpec) -> None:
-    """Give the robot a body to look at around the spheres that collide."""
+def dress(spec: mujoco.MjSpec) -> None:
+    """Give the robot a body to look at around the spheres that collide, which physics ignores."""
     kind = mujoco.mjtGeom
     for name, colour, shine in (
         (COAT, (0.5,) * 3, 0.5),

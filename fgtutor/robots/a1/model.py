@@ -20,7 +20,8 @@ from jaxtyping import Float
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.io.validation import check_fields
-from fgtutor.world.terrain import Box
+from fgtutor.world.boxes import Box
+from fgtutor.world.terrain import World
 
 Gain = Annotated[float, Interval(gt=0, le=1000)]
 """A stiffness or a torque."""
@@ -55,8 +56,6 @@ JOINT_RANGES = {
     "calf": (-2.69653369433, -0.916297857297),
 }
 """Limits of each joint, rad (URDF)."""
-VELOCITY_LIMIT = 21.0
-"""Highest joint speed, rad/s (URDF). Not enforced by the model; rewards and checks may use it."""
 
 STANCE = (-0.1, 0.9, -1.7, 0.1, 0.9, -1.7, -0.1, 1.0, -1.7, 0.1, 1.0, -1.7)
 """Joint angles the robot stands in and actions are relative to, rad (legs slightly apart)."""
@@ -184,13 +183,11 @@ def build_spec(
     heightfield: ElevationMap | None = None,
     *,
     config: A1Config | None = None,
-    visuals: bool = False,
 ) -> mujoco.MjSpec:
     """Return the A1 on the given terrain; on an endless flat floor if none is given.
 
-    Boxes have exact edges and are faster; a height field takes any filled map. `visuals` adds a
-    light and shapes to look at, which physics neither needs nor feels: qpos means the same.
-    Raises `ConfigError` if the height field has unknown cells.
+    Boxes have exact edges and are faster; a height field takes any filled map. Raises `ConfigError`
+    if the height field has unknown cells.
     """
     config = config or A1Config()
     boxes = tuple(boxes)
@@ -198,10 +195,7 @@ def build_spec(
     spec.modelname = "a1"
     spec.compiler.degree = False
     _set_options(spec, config)
-    if visuals:
-        sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-        spec.worldbody.add_light(name="sun", type=sun, pos=(0.0, 0.0, 10.0), dir=(0.3, 0.2, -1.0))
-    _add_robot(spec, config, visuals)
+    _add_robot(spec, config)
     for box in boxes:
         add_box(spec, box)
     if heightfield is not None:
@@ -212,6 +206,20 @@ def build_spec(
     key.qpos = (0.0, 0.0, STANCE_HEIGHT, 1.0, 0.0, 0.0, 0.0, *STANCE)
     key.ctrl = STANCE
     return spec
+
+
+def world_spec(world: World, model: A1Config) -> mujoco.MjSpec:
+    """Return the model of the world: boxes if its ground is made of blocks, else a height field."""
+    tiles = [tile for row in world.tiles for tile in row]
+    if all(tile.boxes or _blocky(tile.elevation) for tile in tiles):
+        return build_spec(world.boxes, config=model)
+    return build_spec(heightfield=world.elevation.filled(), config=model)
+
+
+def _blocky(elevation: ElevationMap) -> bool:
+    """Tell whether most neighbouring cells have equal heights, so that few boxes suffice."""
+    heights = np.asarray(elevation.filled().heights)
+    return all(float((np.diff(heights, axis=k) == 0).mean()) > 0.9 for k in (0, 1))
 
 
 def add_box(spec: mujoco.MjSpec, box: Box) -> None:
@@ -272,7 +280,7 @@ def _set_options(spec: mujoco.MjSpec, config: A1Config) -> None:
     spec.visual.global_.bvactive = False
 
 
-def _add_robot(spec: mujoco.MjSpec, config: A1Config, visuals: bool) -> None:
+def _add_robot(spec: mujoco.MjSpec, config: A1Config) -> None:
     trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, STANCE_HEIGHT))
     trunk.add_freejoint(name="trunk")
     trunk.sleep = mujoco.mjtSleepPolicy.mjSLEEP_NEVER
@@ -285,18 +293,12 @@ def _add_robot(spec: mujoco.MjSpec, config: A1Config, visuals: bool) -> None:
         x, y = _side(leg)
         corner = (x * length / 2, y * (width / 2 - radius), 0.0)
         _add_collider(trunk, f"{leg}_corner", corner, radius)
-    if visuals:
-        box = mujoco.mjtGeom.mjGEOM_BOX
-        _add_shape(trunk, type=box, size=(length / 2, width / 2, height / 2))
-        _add_shape(trunk, type=box, pos=(LEG_X, 0.0, 0.0), size=(0.07, 0.05, 0.04))
     for leg in LEGS:
-        _add_leg(spec, trunk, leg, config, visuals)
+        _add_leg(spec, trunk, leg, config)
     _add_sensors(spec)
 
 
-def _add_leg(
-    spec: mujoco.MjSpec, trunk: mujoco.MjsBody, leg: str, config: A1Config, visuals: bool
-) -> None:
+def _add_leg(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, leg: str, config: A1Config) -> None:
     x, y = _side(leg)
     hip = trunk.add_body(name=f"{leg}_hip", pos=(x * LEG_X, y * LEG_Y, 0.0))
     thigh = hip.add_body(name=f"{leg}_thigh", pos=(0.0, y * HIP_OFFSET, 0.0))
@@ -329,11 +331,6 @@ def _add_leg(
     _add_collider(calf, f"{leg}_shin", (0.0, 0.0, -CALF_LENGTH / 2), 0.015)
     _add_collider(calf, f"{leg}_foot", (0.0, 0.0, -CALF_LENGTH), FOOT_RADIUS)
     calf.add_site(name=f"{leg}_foot", pos=(0.0, 0.0, -CALF_LENGTH))
-    if visuals:
-        ends = ((0.0, y * HIP_OFFSET, 0.0), (0.0, 0.0, -THIGH_LENGTH), (0.0, 0.0, -CALF_LENGTH))
-        for body, end, radius in zip((hip, thigh, calf), ends, (0.04, 0.017, 0.01), strict=True):
-            capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
-            _add_shape(body, type=capsule, fromto=(0.0, 0.0, 0.0, *end), size=(radius, 0.0, 0.0))
 
 
 def _side(leg: str) -> tuple[int, int]:
@@ -359,10 +356,6 @@ def _add_collider(
         conaffinity=0,
         group=3,
     )
-
-
-def _add_shape(body: mujoco.MjsBody, **properties: object) -> None:
-    body.add_geom(contype=0, conaffinity=0, group=2, rgba=(0.22, 0.23, 0.26, 1.0), **properties)
 
 
 def _add_sensors(spec: mujoco.MjSpec) -> None:

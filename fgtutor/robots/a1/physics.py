@@ -65,22 +65,10 @@ class Physics:
         self.reset()
         self.forward()
 
-    def __repr__(self) -> str:
-        return (
-            f"Physics({self.num_sims} simulations on {self.threads} threads, "
-            f"nq={self.model.nq}, nv={self.model.nv}, nu={self.model.nu}, "
-            f"ngeom={self.model.ngeom}, dt={self.model.opt.timestep:g} s)"
-        )
-
     @property
     def num_sims(self) -> int:
         """How many simulations run side by side."""
         return self._batch.nsim
-
-    @property
-    def threads(self) -> int:
-        """How many threads step them."""
-        return self._batch.nthread
 
     def step(self, n: int = 1) -> None:
         """Advance every simulation by `n` time steps with the present controls."""
@@ -97,7 +85,7 @@ class Physics:
         Write their poses to `qpos` next, then call `forward` with the same ids.
         """
         if ids is None or ids.numel():
-            # Forwarding is left to the caller, who has yet to place the robots.
+            # Forwarding is left to the caller, which has yet to place the robots.
             keyframe = 0 if self.model.nkey else -1
             stage = int(mujoco.mjtStage.mjSTAGE_NONE)
             self._call(self._batch.reset, _numpy(ids), keyframe=keyframe, stage=stage)
@@ -130,14 +118,9 @@ class Physics:
         """
         return torch.from_numpy(self._batch.expand(name))
 
-    def set_const(self, ids: Int64[Tensor, " ids"] | None = None) -> None:
-        """Recompute the constants that follow from masses and inertias, for some simulations."""
-        if ids is None or ids.numel():
-            self._call(self._batch.set_const, _numpy(ids))
-
-    def data(self, sim: int) -> mujoco.MjData:
-        """Return a copy of one simulation, to draw it or to pass it to any MuJoCo function."""
-        return self._batch.get_data(sim)
+    def set_const(self) -> None:
+        """Recompute the constants that follow from masses and inertias."""
+        self._call(self._batch.set_const)
 
     def _call(self, function: Any, *args: Any, **kwargs: Any) -> None:
         """Call MuJoCo, turning its errors into ours and its log file into Python warnings."""
