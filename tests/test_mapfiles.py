@@ -273,10 +273,10 @@ def test_png_sidecars_that_say_something_else(tmp_path: Path, notes: str, messag
 @pytest.mark.parametrize(
     ("picture", "message"),
     [
-        (Image.new("1", (4, 4)), "8 or 16 bits, this one has 1 bits"),
-        (Image.new("P", (4, 4)), "one channel of grey.*palette"),
-        (Image.new("LA", (4, 4)), "one channel of grey.*alpha"),
-        (Image.new("RGBA", (4, 4)), "one channel of grey.*alpha"),
+        (Image.new("1", (4, 4)), "8 or 16 bits, this one holds 1"),
+        (Image.new("P", (4, 4)), "one channel of grey.*holds P"),
+        (Image.new("LA", (4, 4)), "one channel of grey.*holds LA"),
+        (Image.new("RGBA", (4, 4)), "one channel of grey.*holds RGBA"),
     ],
 )
 def test_pngs_that_are_no_heights(tmp_path: Path, picture: Image.Image, message: str) -> None:

@@ -6,7 +6,7 @@ about its numbers is obeyed, or the file is refused; so it is if it says what is
 
 import hashlib
 import mmap
-import struct
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,7 +32,6 @@ _UNKNOWN = 65535
 """The PNG value of an unknown cell; heights use 0..65534."""
 _PARTS = ("heights", "known", "resolution", "origin")
 _CURE = "write it again with ElevationMap.save"
-_COLOURS = {0: "grey", 2: "colours", 3: "a palette", 4: "grey and alpha", 6: "colours and alpha"}
 
 
 def write(elevation: "ElevationMap", path: Path) -> None:
@@ -120,22 +119,12 @@ def _load_png(path: Path) -> dict[str, Any]:
         )
     lines = read_file(sidecar, {".yaml": _lines}, "sidecar", MapError, _CURE)
     notes = parse_record(Sidecar, lines, MapError, sidecar.name)
-    with path.open("rb") as file:
-        head = file.read(26)
-    if len(head) == 26 and head[12:16] == b"IHDR":  # before Pillow takes memory
-        width, height, depth, colour = struct.unpack(">IIBB", head[16:])
-        check_cells((width, height))
-        if depth < 8 or colour:
-            raise MapError(
-                f"a height image has one channel of grey of 8 or 16 bits, this one has {depth} "
-                f"bits and {_COLOURS.get(colour, 'unknown colours')}"
-            )
+    values, clear = _picture(path)
     if notes.picture not in (None, _digest(path)):
         raise MapError(
             f"it is not the picture that {sidecar.name} describes: {_CURE} (or delete the line "
             "`picture`, if you changed it on purpose)"
         )
-    values, clear = _picture(path)
 
     def strip(rows: slice) -> tuple[np.ndarray, np.ndarray]:
         some = values[rows]
@@ -151,11 +140,17 @@ def _picture(path: Path) -> tuple[np.ndarray, int | None]:
     with (
         path.open("rb") as file,
         mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+        warnings.catch_warnings(action="ignore"),  # of many pixels, of which we have our own limit
         Image.open(data, formats=["PNG"]) as image,  # pyright: ignore[reportArgumentType]
     ):
-        check_cells(image.size)  # a second header may say otherwise
-        if image.mode not in ("L", "I", "I;16", "I;16B") or getattr(image, "is_animated", False):
-            raise MapError(f"it must hold one picture in grey, this one is {image.mode}")
+        check_cells(image.size)
+        # What the file holds, not what Pillow would make of it: 2 and 4 bits are stretched to 8.
+        raw = image.tile[0][3] if image.tile else image.mode
+        if raw not in ("L", "I;16B") or getattr(image, "is_animated", False):
+            raise MapError(
+                "a height image is one picture with one channel of grey of 8 or 16 bits, this one "
+                f"holds {raw}"
+            )
         return np.asarray(image), image.info.get("transparency")
 
 

@@ -255,7 +255,7 @@ def _record(kind: Any) -> TypeAdapter:
 def _first(problem: ValidationError) -> str:
     """Return what is wrong first, and where, in one line."""
     one = problem.errors(include_url=False, include_context=False)[0]
-    where = ".".join(str(part) for part in one["loc"])
+    where = ascii(".".join(str(part) for part in one["loc"]))[1:-1]
     came = re.sub(r"\s+", " ", repr(one["input"]))
     came = came if len(came) <= 60 else f"{came[:57]}..."
     what = one["msg"].replace("Input should", "should").removeprefix("Value error, ")
