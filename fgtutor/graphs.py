@@ -137,36 +137,34 @@ def reversed_graph(
         fits=total < 2**31,  # scipy's search counts edges in 32 bits
     )
     columns, weights = np.empty(total, dtype=np.int32), np.empty(total)
-    degrees, filled = [np.zeros(1, dtype=np.int32)], 0
+    degrees, filled = np.zeros(states + 1, dtype=np.int32), 0
     into = np.append(-(directions.STEPS[_ORDER] @ (ny, 1)), 0)  # from a step's end to its start
     for new in range(count):
-        entering = _entering(layers[new])
-        there = [entering > 0]
-        tails = [new * nx * ny + into[:8]]
-        others = [old for old in range(count) if old != new]
-        for old in others:
+        entering = _entering(layers[new]).reshape(-1, 8)
+        there, tails = [entering > 0], [new * nx * ny + into[:8]]
+        for old in (old for old in range(count) if old != new):
             # A ninth kind of edge stays in the cell and costs nothing but the change.
             inside, along = changes[old, new]
-            there += [_entering(np.unpackbits(along, axis=-1).view(bool)), inside]
+            leaving = _entering(np.unpackbits(along, axis=-1).view(bool))
+            there += [leaving.reshape(-1, 8), inside.reshape(-1, 1)]
             tails.append(old * nx * ny + into)
         tail = np.concatenate(tails).astype(np.int32)
-        for first in range(0, nx, max(1, STRIP_CELLS // ny)):
-            strip = slice(first, first + max(1, STRIP_CELLS // ny))
-            mask = np.concatenate([part[strip] for part in there], axis=-1).reshape(-1, len(tail))
+        cells = np.flatnonzero((able[new].ravel() != 0) | there[0].any(axis=1)).astype(np.int32)
+        for some in np.array_split(cells, -(-len(cells) // STRIP_CELLS) or 1):
+            mask = np.concatenate([part[some] for part in there], axis=1)
             with np.errstate(divide="ignore"):  # where there is no step F is 0, and the mask False
-                step = step_cost(entering[strip], _ORDER, cost, resolution).reshape(-1, 8)
+                step = step_cost(entering[some], _ORDER, cost, resolution)
             change = np.full((len(step), 9), float(switch_cost))
             change[:, :8] += step
-            cells = np.arange(len(step), dtype=np.int32) + np.int32(first * ny)
             chosen = np.flatnonzero(mask)
             end = filled + len(chosen)
-            columns[filled:end] = (cells[:, None] + tail).ravel().take(chosen)
-            cost_of = np.concatenate([step] + [change] * len(others), axis=1)
+            columns[filled:end] = (some[:, None] + tail).ravel().take(chosen)
+            cost_of = np.concatenate([step] + [change] * (count - 1), axis=1)
             weights[filled:end] = cost_of.ravel().take(chosen)
-            degrees.append(mask.sum(axis=1, dtype=np.int32))
+            degrees[1 + new * nx * ny + some] = mask.sum(axis=1, dtype=np.int32)
             filled = end
+    starts = np.cumsum(degrees, dtype=np.int32)
     graph = csr_array((states, states))
-    starts = np.cumsum(np.concatenate(degrees), dtype=np.int32)
     graph.indptr, graph.indices, graph.data = starts, columns, weights
     return graph
 

@@ -224,9 +224,7 @@ heading_maps(F, big, label="F of the steps specialist")
 # another side: those are the steps that would lead into the unknown.
 
 # %%
-from fgtutor.tensorization import steps_on_known
-
-closed = ~steps_on_known(big.known)
+closed = ~big.known_steps
 print(f"steps closed since they leave known ground: {closed.sum():,} of {closed.size:,}")
 
 # %% [markdown]

@@ -148,9 +148,10 @@ draw_graph(graph, tiny, path, names)
 
 # %%
 from fgtutor import plan
+from fgtutor.planning import PAPER
 
-task = {"grid": M, "start": START, "goal": GOAL, "names": names}
-route = plan(fused, policy_map, tensors=list(tensors.values()), **task)
+task = {"grid": M, "start": START, "goal": GOAL, "names": names, "tensors": list(tensors.values())}
+route = plan(fused, policy_map, settings=PAPER, **task)
 route
 
 # %%
@@ -180,14 +181,13 @@ for key, value in worst.items():
 
 # %%
 from fgtutor import assess
-from fgtutor.tensorization import resolve_taus, why_blocked
+from fgtutor.tensorization import why_blocked
 
 assessments = {name: assess(M, specialist) for name, specialist in zoo.items()}
-taus = {name: resolve_taus("calibrated", specialist) for name, specialist in zoo.items()}
 ix, _ = M.cell_of(6.0, 4.0)
 shut = int((fused[ix].amax(dim=-1) < 0.1).nonzero()[-1])  # in this column of cells
 for x, y in (M.centre_of(ix, shut), (5.7, 6.4)):
-    print(why_blocked(x, y, elevation=M, assessments=assessments, taus=taus))
+    print(why_blocked(x, y, assessments))
 
 # %% [markdown]
 # A learned planner that goes from map to motion in one network could not have told you. This is
@@ -199,13 +199,15 @@ for x, y in (M.centre_of(ix, shut), (5.7, 6.4)):
 # Look at the number of switches in the route above. On flat ground several policies are almost
 # equally good, and $\mathcal P$ changes its mind from cell to cell. The paper's plan does not
 # mind: switching is free there. A real robot stumbles a little at each switch. So let a switch
-# cost something:
+# cost something, as much as a metre of easy ground. And let a diagonal step cost its length: by
+# $1/\hat F$ alone it costs as much as a straight one, and routes zigzag. These are our settings,
+# `PlanSettings()`; the paper's are `PAPER`. Everything in this package uses one of the two:
 
 # %%
 from fgtutor.course.lessons import compare_routes
 
-calm = plan(fused, policy_map, tensors=list(tensors.values()), switch_cost=3.0, **task)
-compare_routes(M, {"switching is free (the paper)": route, "a switch costs 3": calm})
+calm = plan(fused, policy_map, **task)
+compare_routes(M, {"the paper's settings": route, "ours: a switch costs 1": calm})
 
 # %% [markdown]
 # *What to see:* fewer switches, at hardly any price in length.
@@ -259,18 +261,14 @@ draw_elevation(L)
 # the standard of the field. The same search on both.
 
 # %%
-from fgtutor.baselines import View, find_route, planners
-from fgtutor.errors import PlanningError
+from fgtutor.baselines import AssessedMap, find_route, planners
 
 low_side, high_side = (0.6, 1.6), (4.4, 1.6)
-view = View(L, zoo, "calibrated")
+ground = AssessedMap(L, zoo)
 
 
 def ask(name, start, goal):
-    try:
-        return find_route(planners(zoo)[name], view, start, goal, switch_cost=3.0)
-    except PlanningError as error:
-        return f"no route: {type(error).__name__}"
+    return find_route(planners(zoo)[name], ground, start, goal)  # a Route, or a Refusal
 
 
 # %%
@@ -297,10 +295,10 @@ from fgtutor import make_terrain
 
 for seed in range(1, 40, 2):
     corridor = make_terrain("mixed", robot="toy", seed=seed)
-    view = View(corridor.elevation, zoo, "calibrated")
+    ground = AssessedMap(corridor.elevation, zoo)
     answer = ask("ours", corridor.start, corridor.goal)
     print(f"corridor {seed}: {answer}")
-    if not isinstance(answer, str):
+    if answer:  # a Refusal is False
         break
 
 # %%
@@ -328,8 +326,8 @@ compare_routes(
 # - Replace the maximum by the mean: `torch.stack(list(tensors.values())).mean(dim=0)` as `fused`.
 #   Which lane does the route take, if any?
 # - Fire the gaps specialist. Plan again. What does the second best way cost?
-# - `plan(..., cost="length")` multiplies each step's cost by its length. The paper's cost does
-#   not: a diagonal step costs as much as a straight one. Compare the routes.
+# - `plan(..., cost="inverse")` is the paper's cost alone: a diagonal step costs as much as a
+#   straight one. Compare the routes.
 # - `plan(..., backend="networkx")` searches the graph you have seen. Compare cost and time with
 #   the default.
 #

@@ -19,18 +19,16 @@
 
 # %%
 from fgtutor import load_zoo, make_terrain
-from fgtutor.errors import PlanningError
-from fgtutor.pipeline import plan_on_map
+from fgtutor.planning import plan_on_map
 
 zoo = load_zoo("toy")
 for seed in range(1, 40, 2):
     terrain = make_terrain("mixed", robot="toy", seed=seed)
     M, start, goal = terrain.elevation, terrain.start, terrain.goal
-    try:
-        planned = plan_on_map(M, zoo, start, goal, switch_cost=3.0)
+    planned = plan_on_map(M, zoo, start, goal)
+    if planned.answer:  # a Route, or a Refusal, which is False
         break
-    except PlanningError as error:
-        print(f"corridor {seed} is refused: {type(error).__name__}")
+    print(f"corridor {seed}: {planned.answer}")
 planned.route
 
 # %%
@@ -191,12 +189,13 @@ from tqdm import tqdm
 
 from fgtutor import make_terrain
 from fgtutor.evaluation.trials import Ground, drive
+from fgtutor.planning import PlanSettings
 
 rows = []
 for kind in tqdm(kinds):
     tiles = [make_terrain(kind, robot="toy", seed=2 * i + 1) for i in range(trials)]
     grounds = [Ground(terrain=tile, seeds=(i,)) for i, tile in enumerate(tiles)]
-    rows += drive(grounds, chosen, everyone, switch_cost=3.0)
+    rows += drive(grounds, chosen, everyone, settings=PlanSettings())
 
 # %%
 from fgtutor.figures.charts import draw_table
@@ -255,8 +254,8 @@ for successes in (0, trials // 2, trials):
 #
 # - `plan_on_map(..., switch_cost=0.0)`: does the flickering hurt when it is driven?
 # - Set `FollowConfig(hold_steps=1)` or `15`. What does hysteresis buy, and what does it cost?
-# - Plan with the paper's taus, `plan_on_map(..., taus="paper")`. Is the route another? Is it
-#   driven more safely?
+# - Plan with the paper's settings, `plan_on_map(..., settings=PAPER)`. Is the route another? Is
+#   it driven more safely?
 # - Let `roll` of notebook 02 drive a corridor that the plan refused. Was it right to refuse?
 #
 # **Exercises:** [exercises/ex07.ipynb](../exercises/ex07.ipynb). **Next:** a robot with legs,

@@ -127,17 +127,13 @@ strip
 # `f_min`. That number is a choice. What would each stage do with another?
 
 # %%
-from fgtutor.errors import PlanningError
-from fgtutor.pipeline import plan_on_map
+from fgtutor.planning import plan_on_map
 
 
 def length(name, f_min):
     tensors = {name: plans[name][0]}
-    try:
-        return plan_on_map(M, {name: stages[name]}, start, goal, f_min=f_min, cost=config.cost,
-                           tensors=tensors).route.length  # fmt: skip
-    except PlanningError:
-        return np.nan
+    plan = plan_on_map(M, {name: stages[name]}, start, goal, tensors=tensors, f_min=f_min)
+    return plan.route.length if plan.answer else np.nan
 
 
 # %%

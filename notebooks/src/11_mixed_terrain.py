@@ -35,20 +35,18 @@ def corridor(kind, seed):
 
 
 # %%
-from fgtutor.baselines import View, find_route, ours
+from fgtutor.baselines import AssessedMap, find_route, ours
 from fgtutor.course.a1_lessons import daring_route
 from fgtutor.course.notebooks import budget
-from fgtutor.errors import PlanningError
 
 for seed in range(1, 2 * budget(fast=2, full=8, unit="courses at most", each=2.0), 2):
     terrain = corridor("mixed", seed)
-    view = View(terrain.elevation, everyone, "calibrated")
-    try:
-        route = find_route(ours, view, terrain.start, terrain.goal, switch_cost=1.0)
+    assessed = AssessedMap(terrain.elevation, everyone)
+    route = find_route(ours, assessed, terrain.start, terrain.goal)
+    if route:  # a Refusal is False
         break
-    except PlanningError as error:
-        print(f"course {seed} is refused: {error}")
-        route = daring_route(view, terrain.start, terrain.goal)  # against that advice
+    print(f"course {seed}: {route}")
+    route = daring_route(assessed, terrain.start, terrain.goal)  # against that advice
 route
 
 # %%
@@ -71,12 +69,10 @@ for part in terrain.sections:
 # %%
 from fgtutor.figures.canvas import Picture
 from fgtutor.figures.maps import draw_weight
-from fgtutor.tensorization import resolve_taus
 
 sheet = Picture(7.2, 6.4)
 for axes, name in zip(sheet.subplots(len(zoo), 1, sharex=True), zoo, strict=True):
-    taus = resolve_taus("calibrated", zoo[name])
-    draw_weight(view.assessment(name).ood(*taus), M, name, axes=axes)
+    draw_weight(assessed.assessment(name).ood(), M, name, axes=axes)
     axes.set(xlabel="")
 sheet
 
@@ -94,7 +90,7 @@ sheet
 from fgtutor import fuse
 from fgtutor.figures.maps import draw_policy_map, draw_route
 
-fused, policy_map = fuse([view.tensor(name) for name in zoo])
+fused, policy_map = fuse(list(assessed.tensors().values()))
 draw_policy_map(policy_map, fused, M, tuple(zoo))
 
 # %%
@@ -131,8 +127,8 @@ heading = directions.NAMES.index(worst["heading"])
 x, y = M.centre_of(*worst["cell"])
 print(f"the step it liked least: at ({x:.1f}, {y:.1f}) m, heading {worst['heading']}")
 for name in zoo:
-    ix, iy = worst["cell"]
-    f, F = (tensor[ix, iy, heading] for tensor in (view.f(name), view.tensor(name)))
+    (ix, iy), one = worst["cell"], assessed.assessment(name)
+    f, F = (tensor[ix, iy, heading] for tensor in (one.closed(one.f), one.weighted()))
     print(f"{name:7} f = {f:.3f}, with w_ood {F:.3f}")
 
 # %% [markdown]
@@ -192,17 +188,10 @@ contestants = [*zoo, "ours", *(["general"] if "general" in everyone else [])]
 ways = planners(everyone)
 
 
-def ask(name, view, ground):
-    try:
-        return find_route(ways[name], view, ground.start, ground.goal, switch_cost=1.0)
-    except PlanningError:
-        return None
-
-
-# %%
-def compete(ground, view, seeds):
-    """Let everyone plan, and all who have a route walk, side by side; count what came of it."""
-    routes = {name: ask(name, view, ground) for name in contestants}
+def compete(ground, assessed, seeds):
+    """Plan with each planner, walk all the routes side by side, and count what came of it."""
+    ends = ground.start, ground.goal
+    routes = {name: find_route(ways[name], assessed, *ends) for name in contestants}
     going = [(name, seed) for name in contestants if routes[name] for seed in seeds]
     walks = drive_together([(routes[n], ground, s) for n, s in going], everyone, config=follow)
     outcomes = {name: Counter() for name in contestants}
@@ -215,7 +204,7 @@ def compete(ground, view, seeds):
 
 # %%
 trials = budget(fast=2, full=10, unit="walks for each of them", each=1.5)
-table = {"mixed": compete(terrain, view, range(trials))}
+table = {"mixed": compete(terrain, assessed, range(trials))}
 for name in contestants:
     print(f"{name:8}", dict(+table["mixed"][name]))
 
@@ -246,7 +235,7 @@ for kind in tqdm(kinds):
     table[kind] = {name: Counter() for name in contestants}
     for seed in range(101, 101 + count, 2):  # two walks on each ground
         ground = corridor(kind, seed)
-        result = compete(ground, View(ground.elevation, everyone, "calibrated"), range(2))
+        result = compete(ground, AssessedMap(ground.elevation, everyone), range(2))
         for name in contestants:
             table[kind][name] += result[name]
 
@@ -272,8 +261,7 @@ for kind, total in totals.items():
 
 # %% [markdown]
 # That is why the real table has thousands of trials behind it, and why this package never prints a
-# rate without its interval. `fgtutor evaluate matrix --robot a1 --trials 200 --switch-cost 1 --out
-# report` makes one that you can put your name to; `--protocol paper` is the paper's own; it can be
+# rate without its interval. `fgtutor evaluate matrix --robot a1 --trials 200 --out report` makes one that you can put your name to; `--protocol paper` is the paper's own; it can be
 # interrupted, and it says beforehand how long it will take. Notebook 13 shows how to share the
 # work.
 
@@ -281,9 +269,9 @@ for kind, total in totals.items():
 # ## What to try
 #
 # - Take one specialist away: `{n: s for n, s in everyone.items() if n != "bridge"}` in a new
-#   `View`. What does the planner say, and where?
-# - `View(..., taus="paper")`: the paper's one pair of thresholds for all. Who gains ground?
-# - `switch_cost=0.0` is the paper's planning. Count the switches; then walk it.
+#   `AssessedMap`. What does the planner say, and where?
+# - `AssessedMap(..., taus="paper")`: the paper's one pair of thresholds for all. Who gains ground?
+# - `find_route(..., PAPER)` plans by the paper's settings. Count the switches; then walk it.
 # - Plan without headings, `ways["no-heading"]`. On which section does it hurt most, and why there?
 #
 # **Exercises:** [exercises/ex11.ipynb](../exercises/ex11.ipynb). **Next:** nobody gives you a

@@ -150,20 +150,19 @@ for neighbours in (0, to_cells.neighbours):
 
 # %%
 from fgtutor import load_zoo
-from fgtutor.baselines import View, find_route, ours
+from fgtutor.baselines import AssessedMap, find_route, ours
 from fgtutor.course.a1_lessons import daring_route
-from fgtutor.errors import PlanningError
 
 zoo = load_zoo("a1")
-view = View(M, zoo, "calibrated")
+assessed, ends = AssessedMap(M, zoo), (terrain.start, terrain.goal)
 
 
 def route_at(switch_cost):
-    try:
-        return find_route(ours, view, terrain.start, terrain.goal, switch_cost=switch_cost)
-    except PlanningError as error:
-        print("refused:", error)  # go all the same, and see whether that was wise
-        return daring_route(view, terrain.start, terrain.goal, switch_cost=switch_cost)
+    route = find_route(ours, assessed, *ends, switch_cost=switch_cost)
+    if route:
+        return route
+    print(route)  # a Refusal: go all the same, and see whether that was wise
+    return daring_route(assessed, *ends, switch_cost=switch_cost)
 
 
 free, priced = route_at(0.0), route_at(1.0)

@@ -34,19 +34,15 @@ before = load_zoo("a1", team)
 list(before)
 
 # %%
-from fgtutor.baselines import View, find_route, ours
-from fgtutor.errors import PlanningError
+from fgtutor.baselines import AssessedMap, find_route, ours
 
 terrain = make_terrain("valley", robot="a1", seed=1)
 M, ends = terrain.elevation, (terrain.start, terrain.goal)
 
 
 def ask(zoo):
-    view = View(M, zoo, "calibrated")
-    try:
-        return view, find_route(ours, view, *ends, switch_cost=1.0)
-    except PlanningError as error:
-        return view, f"no route ({type(error).__name__})"
+    assessed = AssessedMap(M, zoo)
+    return assessed, find_route(ours, assessed, *ends)
 
 
 # %%
@@ -73,14 +69,14 @@ compare_routes(M, {"before": answer, "with the newcomer": hired})
 
 # %%
 for name in before:
-    same = bool((three.tensor(name) == four.tensor(name)).all())
+    same = bool((three.tensors()[name] == four.tensors()[name]).all())
     print(f"{name:7} thinks of this map what it thought before: {same}")
 
 # %%
 from fgtutor import fuse
 from fgtutor.figures.maps import draw_policy_map
 
-fused, policy_map = fuse([four.tensor(name) for name in after])
+fused, policy_map = fuse(list(four.tensors().values()))
 draw_policy_map(policy_map, fused, M, tuple(after))
 
 # %% [markdown]
@@ -88,7 +84,7 @@ draw_policy_map(policy_map, fused, M, tuple(after))
 # once:
 
 # %%
-alone, _ = fuse([three.tensor(name) for name in before])
+alone, _ = fuse(list(three.tensors().values()))
 print("somewhere worse than before:", bool((fused < alone).any()))
 print(f"better in {(fused > alone).float().mean():.0%} of all cells and headings")
 
