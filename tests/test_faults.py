@@ -26,8 +26,7 @@ KILLS = int(os.environ.get("FGTUTOR_KILLS", "2"))
 SOLUTIONS = Path(__file__).parent.parent / "solutions"
 TRAINING = [
     *("--num-envs", "4", "--steps", "8", "--rows", "2", "--columns", "2"),
-    *("--label-seconds", "0.12", "--feasibility-updates", "1", "--feasibility-batch", "16"),
-    *("--hidden", "8", "--save-every", "2", "--iterations", "8"),
+    *("--label-seconds", "0.12", "--hidden", "8", "--save-every", "2", "--iterations", "8"),
 ]
 
 
