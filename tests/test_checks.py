@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from fgtutor import patches
-from fgtutor.course.checks import ex08, find
+from fgtutor.course.checks import ex08_a1, find
 from fgtutor.directions import STEPS, YAWS
 from fgtutor.elevation import ElevationMap
 from fgtutor.feasibility import calibrated_taus, feasibility_labels, ood_weight, tracking_reward
 from fgtutor.fusion import fuse
-from fgtutor.planning import as_networkx, as_switching_networkx, plan
+from fgtutor.planning import PAPER, as_networkx, as_switching_networkx, plan
 from fgtutor.robots.a1 import model as a1_model
 from fgtutor.robots.a1.randomise import A1EnvConfig
 from fgtutor.robots.crossings import turn_rate
@@ -156,11 +156,11 @@ def test_a_turned_tensor_is_the_tensor_of_the_turned_map(make_specialist, quarte
 
 
 def test_reconstruction_without_decoding_by_decoding():
-    dice = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     decoder, aims, codes = (
-        dice.normal(size=(9, 3)),
-        dice.normal(size=(5, 9)),
-        dice.normal(size=(5, 3)),
+        rng.normal(size=(9, 3)),
+        rng.normal(size=(5, 9)),
+        rng.normal(size=(5, 3)),
     )
     expected = ((aims - codes @ decoder.T) ** 2).sum(axis=-1)
     ours = answer("ex05.q4", codes, (aims**2).sum(-1), aims @ decoder, decoder.T @ decoder)
@@ -194,7 +194,8 @@ def test_cheapest_is_dijkstra_s():
 def test_route_cost_is_that_of_the_planned_route():
     fused = np.random.default_rng(0).uniform(0.2, 1, (6, 5, 8))
     grid = ElevationMap(np.zeros((6, 5)), resolution=1.0)
-    route = plan(fused, np.zeros(fused.shape, int), grid=grid, start=(0.5, 0.5), goal=(5.5, 4.5))
+    ends = {"start": (0.5, 0.5), "goal": (5.5, 4.5)}
+    route = plan(fused, np.zeros(fused.shape, int), grid=grid, **ends, settings=PAPER).raise_for()
     assert answer("ex06.q4", fused, route.cells) == pytest.approx(route.cost)
 
 
@@ -215,9 +216,9 @@ def test_turn_rate_is_the_library_s():
 
 def test_the_a1_s_numbers_are_the_library_s():
     model = a1_model.A1Config()
-    assert (model.kp, model.kd, model.torque_limit) == (ex08.KP, ex08.KD, ex08.LIMIT)
-    assert ex08.MIRROR == a1_model.MIRROR and tuple(ex08.SIGNS) == a1_model.MIRROR_SIGNS
-    assert A1EnvConfig().action_scale == ex08.SCALE
+    assert (model.kp, model.kd, model.torque_limit) == (ex08_a1.KP, ex08_a1.KD, ex08_a1.LIMIT)
+    assert ex08_a1.MIRROR == a1_model.MIRROR and tuple(ex08_a1.SIGNS) == a1_model.MIRROR_SIGNS
+    assert A1EnvConfig().action_scale == ex08_a1.SCALE
 
 
 def test_gravity_is_turned_as_mujoco_turns_it():

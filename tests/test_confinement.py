@@ -9,9 +9,9 @@ import pytest
 
 from fgtutor.course.grading import grade as grading
 from fgtutor.course.grading import sandbox
+from fgtutor.course.grading.answers import decode
 from fgtutor.course.grading.confinement import landlock_version
 from fgtutor.course.grading.grade import GradeConfig, grade
-from fgtutor.course.grading.values import decode
 from tests.test_grading import HONEST, QUICK, submit
 from tests.test_sandbox import asked
 
@@ -160,13 +160,13 @@ def path_length(xy):
 """,
     "the course's checks": """
 import importlib, sys
-for name in ("fgtutor.course.checks", "fgtutor.course.checks.ex10"):
+for name in ("fgtutor.course.checks", "fgtutor.course.checks.ex10_path_length"):
     sys.modules.pop(name, None)
 sys.meta_path[:] = [finder for finder in sys.meta_path if type(finder).__name__ != "_Offered"]
 sys.path.append({clone!r})
 importlib.invalidate_caches()
 try:
-    import fgtutor.course.checks.ex10 as answers
+    import fgtutor.course.checks.ex10_path_length as answers
     path_length, spl, reference_length = [question.truth for question in answers.QUESTIONS]
 except Exception:
     pass

@@ -12,8 +12,8 @@ from fgtutor.course import checks, exercises
 from fgtutor.course.checks import EXERCISES, check, find, hint, questions_of, solution
 from fgtutor.course.checks.question import CRASHED, NOT_STARTED, PASSED, TOO_SLOW, WRONG, Judge
 from fgtutor.course.exercises import ExercisesConfig
-from fgtutor.course.grading.asking import ask
 from fgtutor.course.grading.grade import GradeConfig, grade
+from fgtutor.course.grading.replies import reply_of
 from fgtutor.errors import ConfigError, NotebookError
 
 QUESTIONS = [question for exercise in EXERCISES for question in questions_of(exercise)]
@@ -46,7 +46,11 @@ def test_every_exercise_asks_at_least_three_questions_in_order(exercise):
 @BY_ID
 def test_every_question_has_hints_and_typical_mistakes(question):
     assert len(question.hints) >= 2
-    assert len({mistake.name for mistake in question.mistakes}) == len(question.mistakes) >= 3
+    assert (
+        len({mistake.says.partition(":")[0] for mistake in question.mistakes})
+        == len(question.mistakes)
+        >= 3
+    )
     assert question.expects.endswith(".") and question.points > 0
 
 
@@ -58,9 +62,9 @@ def test_every_typical_mistake_fails_and_is_named(question):
         for mistake in question.mistakes:
             wrong = mistake.answer if question.draw else mistake.answer()
             with np.errstate(all="ignore"):
-                verdict = judge.judge(ask(wrong, arguments, 20.0))
-            assert verdict.outcome == WRONG, mistake.name
-            assert f"Looks like {mistake.name}: {mistake.says}" in verdict.detail
+                verdict = judge.judge(reply_of(wrong, arguments, 20.0))
+            assert verdict.outcome == WRONG, mistake.says
+            assert f"Looks like {mistake.says}" in verdict.detail
             assert f"Expected: {question.expects}" in verdict.detail
 
 

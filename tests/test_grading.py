@@ -228,14 +228,14 @@ spl = {"outcome": "passed"}
 reference_length = float("nan")
 """,
     "peek": """
-import fgtutor.course.checks.ex10 as answers
+import fgtutor.course.checks.ex10_path_length as answers
 def path_length(xy): return answers.QUESTIONS[0].truth(xy)
 def spl(*values):
     import fgtutor.statistics
     return fgtutor.statistics.spl(*values)
 import sys
 for path in sys.path:
-    try: exec(open(path + "/fgtutor/course/checks/ex10.py").read())
+    try: exec(open(path + "/fgtutor/course/checks/ex10_path_length.py").read())
     except OSError: pass
 reference_length = globals().get("LENGTHS")
 """,

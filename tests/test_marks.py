@@ -25,6 +25,7 @@ from fgtutor.course.checks.question import (
     plain_name,
 )
 from fgtutor.course.grading import grade as grading
+from fgtutor.course.grading.answers import encode
 from fgtutor.course.grading.grade import GradeConfig, grade
 from fgtutor.course.grading.marks import (
     Mark,
@@ -35,7 +36,6 @@ from fgtutor.course.grading.marks import (
     settle_clashes,
     table,
 )
-from fgtutor.course.grading.values import encode
 from fgtutor.errors import ConfigError, StorageError
 from tests.test_grading import HONEST, QUICK, submit
 from tests.test_submissions import ANY

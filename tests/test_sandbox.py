@@ -13,12 +13,12 @@ import pytest
 
 from fgtutor.course.grading import grade as grading
 from fgtutor.course.grading import sandbox
-from fgtutor.course.grading.asking import CRASHED, NOT_STARTED, TOO_SLOW
+from fgtutor.course.grading.answers import encode
 from fgtutor.course.grading.confinement import WALLS, landlock_version
 from fgtutor.course.grading.grade import GradeConfig, grade
 from fgtutor.course.grading.marks import table
+from fgtutor.course.grading.replies import CRASHED, NOT_STARTED, TOO_SLOW
 from fgtutor.course.grading.sandbox import Limits, ask_submission
-from fgtutor.course.grading.values import encode
 from fgtutor.errors import ConfigError, GradingError
 from tests.test_grading import HONEST, QUICK, submit
 

@@ -2,9 +2,9 @@
 
 Reads a question's name, such as "ex04.q2", and the learner's function; gives a verdict at once. A
 check inside the learner's own kernel is help, not security: marks come from `fgtutor grade`, which
-asks again in a process of its own with cases drawn from the instructor's seed.
+calls the function in a process of its own with cases drawn from the instructor's seed.
 
-Each file exNN.py holds the questions of one exercise; CONTRIBUTING.md has the recipe for another.
+Each file exNN_SUBJECT.py holds one exercise; CONTRIBUTING.md has the recipe for another.
 """
 
 import importlib
@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from fgtutor.course.checks.question import CASES, PASSED, Judge, Question, Verdict
-from fgtutor.course.grading.asking import ask
+from fgtutor.course.grading.replies import reply_of
 from fgtutor.errors import ConfigError
 
 __all__ = ["EXERCISES", "check", "hint", "questions_of", "solution"]
 
-EXERCISES = tuple(f"ex{number:02}" for number in range(1, 13))
+_MODULES = {path.stem[:4]: path.stem for path in sorted(Path(__file__).parent.glob("ex??_*.py"))}
+EXERCISES = tuple(_MODULES)
 """One for each of the notebooks 01-12."""
 SOLUTIONS = Path(__file__).with_name("solutions.json")
 """The worked solutions by question; `fgtutor exercises` extracts them from the masters."""
@@ -45,7 +46,7 @@ def check(question: str, answer: Any, *, seed: int = 0, cases: int = CASES) -> V
     """
     asked = find(question)
     arguments = asked.cases(seed, cases)
-    verdict = Judge(asked, arguments).judge(ask(answer, arguments, SECONDS))
+    verdict = Judge(asked, arguments).judge(reply_of(answer, arguments, SECONDS))
     if verdict.outcome != PASSED:
         advice = f'hint("{question}") gives a hint.'
         return Verdict(asked, verdict.outcome, f"{verdict.detail}\n{advice}".lstrip())
@@ -75,7 +76,7 @@ def questions_of(exercise: str) -> tuple[Question, ...]:
     """Return the questions of an exercise; raises `ConfigError` if there is none of that name."""
     if exercise not in EXERCISES:
         raise ConfigError(f"no exercise {exercise!r}: there are {', '.join(EXERCISES)}")
-    return importlib.import_module(f"fgtutor.course.checks.{exercise}").QUESTIONS
+    return importlib.import_module(f"{__name__}.{_MODULES[exercise]}").QUESTIONS
 
 
 def find(question: str) -> Question:

@@ -2,7 +2,7 @@
 
 Reads a learner's answers; gives a `Verdict` that states the property the answer must have, names
 the mistake if it is a known one, and shows where it differs. A typical mistake is kept as the wrong
-function itself: who gives its answers has made it.
+function itself: an answer with the same results has made it.
 """
 
 import copy
@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from annotated_types import Interval
 
-from fgtutor.course.grading.asking import CRASHED, NOT_STARTED, TOO_SLOW
-from fgtutor.course.grading.values import decode, describe, difference
+from fgtutor.course.grading.answers import decode, describe, difference
+from fgtutor.course.grading.replies import CRASHED, NOT_STARTED, TOO_SLOW
 from fgtutor.errors import ConfigError
 from fgtutor.io.validation import CountOrZero, Seed, check_arguments, parse_record
 
@@ -34,10 +34,8 @@ Cases = Annotated[int, Interval(ge=1, le=10_000)]
 class Mistake:
     """A typical wrong answer."""
 
-    name: str
-    """What went wrong, in a few words: "swapped taus"."""
     says: str
-    """What tells the learner so: a sentence."""
+    """What went wrong, in a few words and a sentence: "swapped taus: tau_low comes first."."""
     answer: Callable[..., Any]
     """The wrong function, called as the right one is."""
 
@@ -93,7 +91,7 @@ class Question:
 
 @dataclass(frozen=True, kw_only=True)
 class Reply:
-    """What `asking.ask` gives, and what a submission may forge."""
+    """What `replies.reply_of` gives, and what a submission may forge."""
 
     question: str = ""
     """Its id, where several are asked."""
@@ -137,7 +135,7 @@ class Judge:
         self.right = answers_of(question.truth, cases)
 
     def judge(self, reply: Mapping[str, Any]) -> Verdict:
-        """Turn a reply of `asking.ask`, which may be forged or broken, into a verdict."""
+        """Turn a reply of `replies.reply_of`, which may be forged or broken, into a verdict."""
         try:
             said = parse_record(Reply, reply, ConfigError, "the reply")
             answers = [decode(answer) for answer in said.answers or []]
@@ -164,7 +162,7 @@ class Judge:
         lines = [f"Expected: {self.question.expects}"]
         mistake = self._recognise(answers)
         if mistake:
-            lines.append(f"Looks like {mistake.name}: {mistake.says}")
+            lines.append(f"Looks like {mistake.says}")
         if self.cases is not None:
             names = inspect.signature(self.question.truth).parameters
             given = ", ".join(

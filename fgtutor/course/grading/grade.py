@@ -20,6 +20,7 @@ from annotated_types import Interval
 
 from fgtutor.course.checks import EXERCISES, questions_of
 from fgtutor.course.checks.question import CASES, Cases, Judge, plain_name, plain_text
+from fgtutor.course.grading.answers import encode
 from fgtutor.course.grading.confinement import WALLS
 from fgtutor.course.grading.marks import (
     KEY,
@@ -41,7 +42,6 @@ from fgtutor.course.grading.submissions import (
     learners_of,
     read_submission,
 )
-from fgtutor.course.grading.values import encode
 from fgtutor.errors import ConfigError, GradingError, NotebookError, StorageError
 from fgtutor.io.machine import usable_cores
 from fgtutor.io.progress import watch

@@ -24,8 +24,8 @@ from typing import Annotated, Any
 
 from annotated_types import Interval
 
-from fgtutor.course.grading.asking import CRASHED, PATIENCE, TOO_SLOW
-from fgtutor.course.grading.values import LARGEST
+from fgtutor.course.grading.answers import LARGEST
+from fgtutor.course.grading.replies import CRASHED, PATIENCE, TOO_SLOW
 from fgtutor.errors import ConfigError, GradingError, MissingExtraError
 from fgtutor.io.validation import check_fields
 

@@ -14,18 +14,18 @@ import time
 import types
 from typing import Any, BinaryIO
 
-from fgtutor.course.grading.asking import (
+from fgtutor.course.grading.answers import decode
+from fgtutor.course.grading.cells import Cells
+from fgtutor.course.grading.confinement import confine
+from fgtutor.course.grading.replies import (
     CRASHED,
     NOT_STARTED,
     TOO_SLOW,
     TooSlow,
-    ask,
     explain,
+    reply_of,
     time_limit,
 )
-from fgtutor.course.grading.cells import Cells
-from fgtutor.course.grading.confinement import confine
-from fgtutor.course.grading.values import decode
 
 OFFERED = ("fgtutor.directions",)
 """Modules of ours that a submission may import; they load neither torch nor a simulator."""
@@ -124,6 +124,6 @@ def answer(
                 return reply
         return {"outcome": NOT_STARTED, "detail": f"the notebook defines no `{name}`"}
     try:
-        return ask(namespace[name], cases, seconds, patience=0)
+        return reply_of(namespace[name], cases, seconds, patience=0)
     except BaseException as error:  # whatever a submission raises to get out of here
         return {"outcome": CRASHED, "detail": type(error).__name__}

@@ -12,12 +12,12 @@ def _steps(xy: np.ndarray) -> np.ndarray:
     return np.hypot(*np.diff(xy, axis=0).T)
 
 
-def _trials(dice: np.random.Generator) -> tuple:
+def _trials(rng: np.random.Generator) -> tuple:
     n = 12
-    reference = dice.uniform(4, 8, n)
-    length = reference * dice.uniform(0.9, 3, n)
+    reference = rng.uniform(4, 8, n)
+    length = reference * rng.uniform(0.9, 3, n)
     length[0] = 0.9 * reference[0]  # shorter than the reference: capped
-    success = dice.uniform(size=n) < 0.7
+    success = rng.uniform(size=n) < 0.7
     success[:3] = True, False, True
     return success, length, reference
 
@@ -30,39 +30,29 @@ QUESTIONS = (
         title="how far did it walk?",
         expects="the sum of the distances between consecutive positions, m: never shorter than the "
         "straight line from first to last.",
-        draw=lambda dice: (np.cumsum(dice.normal(0.1, 0.2, (int(dice.integers(5, 20)), 2)), 0),),
+        draw=lambda rng: (np.cumsum(rng.normal(0.1, 0.2, (int(rng.integers(5, 20)), 2)), 0),),
         truth=lambda xy: _steps(xy).sum(),
         mistakes=(
             Mistake(
-                "the straight line",
-                "that is how far it got, not how far it walked.",
+                "the straight line: that is how far it got, not how far it walked.",
                 lambda xy: np.hypot(*(xy[-1] - xy[0])),
             ),
             Mistake(
-                "squared steps",
-                "the distance is the square ROOT of dx^2 + dy^2, for each step.",
+                "squared steps: the distance is the square ROOT of dx^2 + dy^2, for each step.",
                 lambda xy: (_steps(xy) ** 2).sum(),
             ),
+            Mistake("mean for sum: every step counts in full.", lambda xy: _steps(xy).mean()),
             Mistake(
-                "mean for sum",
-                "every step counts in full.",
-                lambda xy: _steps(xy).mean(),
-            ),
-            Mistake(
-                "the distance along the axes",
-                "|dx| + |dy| walks around the corner of every step.",
+                "the distance along the axes: |dx| + |dy| walks around the corner of every step.",
                 lambda xy: np.abs(np.diff(xy, axis=0)).sum(),
             ),
             Mistake(
-                "one root for all",
-                "each step has a length of its own: the root comes before the sum.",
+                "one root for all: each step has a length of its own: the root comes before the "
+                "sum.",
                 lambda xy: np.sqrt((_steps(xy) ** 2).sum()),
             ),
         ),
-        hints=(
-            "np.diff(xy, axis=0) are the steps.",
-            "np.linalg.norm(..., axis=-1).sum()",
-        ),
+        hints=("np.diff(xy, axis=0) are the steps.", "np.linalg.norm(..., axis=-1).sum()"),
     ),
     Question(
         id="ex10.q2",
@@ -70,36 +60,31 @@ QUESTIONS = (
         points=2,
         title="success weighted by path length",
         expects="the mean over ALL trials of success * reference / max(length, reference): a "
-        "failure "
-        "counts 0, a detour less, and no trial more than 1.",
+        "failure counts 0, a detour less, and no trial more than 1.",
         draw=_trials,
         truth=lambda success, length, reference: np.mean(
             np.where(success, np.minimum(reference / length, 1.0), 0.0)
         ),
         mistakes=(
             Mistake(
-                "failures that count",
-                "a trial that failed adds 0, however short its way was.",
+                "failures that count: a trial that failed adds 0, however short its way was.",
                 lambda s, length, ref: np.mean(ref / np.maximum(length, ref)),
             ),
             Mistake(
-                "a mean over successes alone",
-                "then one lucky trial in a hundred looks like a perfect planner.",
+                "a mean over successes alone: then one lucky trial in a hundred looks like a "
+                "perfect planner.",
                 lambda s, length, ref: np.mean((ref / np.maximum(length, ref))[s]),
             ),
             Mistake(
-                "a quotient upside down",
-                "a detour must make the number smaller.",
+                "a quotient upside down: a detour must make the number smaller.",
                 lambda s, length, ref: np.mean(s * np.maximum(length, ref) / ref),
             ),
             Mistake(
-                "a forgotten max",
-                "a way shorter than the reference must not count more than 1.",
+                "a forgotten max: a way shorter than the reference must not count more than 1.",
                 lambda s, length, ref: np.mean(s * ref / length),
             ),
             Mistake(
-                "the success rate",
-                "every success counts 1, whatever way it took.",
+                "the success rate: every success counts 1, whatever way it took.",
                 lambda s, length, ref: np.mean(s),
             ),
         ),
@@ -118,23 +103,22 @@ QUESTIONS = (
         truth=lambda: float(np.mean(LENGTHS * SPLS)),
         mistakes=(
             Mistake(
-                "the shortest path in the table",
-                "with a reference of 9.73 m the last column would have an SPL of 1, not 0.51.",
+                "the shortest path in the table: with a reference of 9.73 m the last column would "
+                "have an SPL of 1, not 0.51.",
                 lambda: 9.73,
             ),
             Mistake(
-                "a length divided by its SPL",
-                "SPL = reference / length, so the reference is SPL TIMES length.",
+                "a length divided by its SPL: SPL = reference / length, so the reference is SPL "
+                "TIMES length.",
                 lambda: 9.73 / 0.51,
             ),
             Mistake(
-                "the mean of the lengths",
-                "a reference is what a perfect planner would walk.",
+                "the mean of the lengths: a reference is what a perfect planner would walk.",
                 lambda: float(LENGTHS.mean()),
             ),
             Mistake(
-                "the last length for the reference of all",
-                "use each column's own length with its own SPL.",
+                "the last length for the reference of all: use each column's own length with its "
+                "own SPL.",
                 lambda: float((9.73 * SPLS).mean()),
             ),
         ),

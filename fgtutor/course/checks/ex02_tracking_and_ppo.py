@@ -7,15 +7,15 @@ from fgtutor.course.checks.question import Mistake, Question
 SIGMA = 0.25
 
 
-def _velocities(dice: np.random.Generator) -> tuple:
-    command = dice.uniform(-1, 1, (6, 2))
-    return command + dice.uniform(-0.5, 0.5, (6, 2)), command
+def _velocities(rng: np.random.Generator) -> tuple:
+    command = rng.uniform(-1, 1, (6, 2))
+    return command + rng.uniform(-0.5, 0.5, (6, 2)), command
 
 
-def _episode(dice: np.random.Generator) -> tuple:
-    steps = int(dice.integers(10, 16))
-    fell = np.arange(steps) >= dice.integers(4, 8)
-    return dice.uniform(0.2, 1, steps), fell, int(dice.integers(3, 6))
+def _episode(rng: np.random.Generator) -> tuple:
+    steps = int(rng.integers(10, 16))
+    fell = np.arange(steps) >= rng.integers(4, 8)
+    return rng.uniform(0.2, 1, steps), fell, int(rng.integers(3, 6))
 
 
 def _labels(r_v: np.ndarray, fell: np.ndarray, window: int, first: int = 0) -> np.ndarray:
@@ -31,10 +31,10 @@ def _of_survivors(r_v: np.ndarray, fell: np.ndarray, window: int) -> np.ndarray:
     return sums / np.maximum(counts, 1)
 
 
-def _rewards(dice: np.random.Generator) -> tuple:
+def _rewards(rng: np.random.Generator) -> tuple:
     done = np.zeros(9, dtype=bool)
-    done[dice.integers(2, 6)] = True
-    return dice.uniform(0, 1, 9), done, float(dice.uniform(0.8, 0.99))
+    done[rng.integers(2, 6)] = True
+    return rng.uniform(0, 1, 9), done, float(rng.uniform(0.8, 0.99))
 
 
 def _returns(rewards: np.ndarray, done: np.ndarray, gamma: float) -> np.ndarray:
@@ -45,8 +45,8 @@ def _returns(rewards: np.ndarray, done: np.ndarray, gamma: float) -> np.ndarray:
     return weight @ rewards
 
 
-def _ratios(dice: np.random.Generator) -> tuple:
-    return dice.uniform(0.4, 1.8, 12), dice.normal(0, 1, 12), float(dice.choice([0.1, 0.2, 0.3]))
+def _ratios(rng: np.random.Generator) -> tuple:
+    return rng.uniform(0.4, 1.8, 12), rng.normal(0, 1, 12), float(rng.choice([0.1, 0.2, 0.3]))
 
 
 QUESTIONS = (
@@ -56,40 +56,37 @@ QUESTIONS = (
         points=3,
         title="the tracking reward r_v",
         expects="r_v = exp(-||v - v_cmd|| / 0.25): 1 when the command is met, 1/e when the "
-        "velocity "
-        "is 0.25 m/s off in any direction.",
+        "velocity is 0.25 m/s off in any direction.",
         draw=_velocities,
         examples=((np.array([[0.5, 0.0], [0.5, 0.25]]), np.array([[0.5, 0.0], [0.5, 0.0]])),),
         truth=lambda velocity, command: np.exp(-np.hypot(*(velocity - command).T) / SIGMA),
         mistakes=(
             Mistake(
-                "the squared norm",
-                "Eq. 1 has the norm itself, so that a small error is already felt.",
+                "the squared norm: Eq. 1 has the norm itself, so that a small error is already "
+                "felt.",
                 lambda v, c: np.exp(-((v - c) ** 2).sum(axis=-1) / SIGMA),
             ),
             Mistake(
-                "a forgotten sigma",
-                "the norm is divided by 0.25 m/s before the exponential.",
+                "a forgotten sigma: the norm is divided by 0.25 m/s before the exponential.",
                 lambda v, c: np.exp(-np.linalg.norm(v - c, axis=-1)),
             ),
             Mistake(
-                "a multiplication by sigma",
-                "dividing by 0.25 makes errors count more, multiplying less.",
+                "a multiplication by sigma: dividing by 0.25 makes errors count more, multiplying "
+                "less.",
                 lambda v, c: np.exp(-np.linalg.norm(v - c, axis=-1) * SIGMA),
             ),
             Mistake(
-                "the sum of both errors",
-                "|ex| + |ey| is not the length of the error.",
+                "the sum of both errors: |ex| + |ey| is not the length of the error.",
                 lambda v, c: np.exp(-np.abs(v - c).sum(axis=-1) / SIGMA),
             ),
             Mistake(
-                "one norm for the whole batch",
-                "each robot has an error of its own: np.linalg.norm needs axis=-1.",
+                "one norm for the whole batch: each robot has an error of its own: np.linalg.norm "
+                "needs axis=-1.",
                 lambda v, c: np.exp(-np.linalg.norm(v - c) / SIGMA),
             ),
             Mistake(
-                "the forward error alone",
-                "a robot that drifts sideways does not track its command either.",
+                "the forward error alone: a robot that drifts sideways does not track its command "
+                "either.",
                 lambda v, c: np.exp(-np.abs(v - c)[:, 0] / SIGMA),
             ),
         ),
@@ -104,38 +101,32 @@ QUESTIONS = (
         points=2,
         title="what the Feasibility-Net is taught",
         expects="the label of step t is the mean of r_v over steps t ... t + window - 1 (fewer at "
-        "the "
-        "end of the rollout), in which every step of a fallen robot counts as 0.",
+        "the end of the rollout), in which every step of a fallen robot counts as 0.",
         draw=_episode,
         truth=lambda r_v, fell, window: _labels(r_v, fell, window),
         mistakes=(
             Mistake(
-                "a mean over survivors",
-                "steps after the fall are left out instead of counting 0: that hides the very "
-                "places "
-                "where robots fall.",
+                "a mean over survivors: steps after the fall are left out instead of counting 0: "
+                "that hides the very places where robots fall.",
                 _of_survivors,
             ),
             Mistake(
-                "a fall that costs nothing",
-                "r_v goes on after the fall; a robot on its back tracks nothing.",
+                "a fall that costs nothing: r_v goes on after the fall; a robot on its back tracks "
+                "nothing.",
                 lambda r_v, fell, window: _labels(r_v, fell & False, window),
             ),
             Mistake(
-                "a window that looks back",
-                "feasibility predicts what comes NEXT, from here on.",
+                "a window that looks back: feasibility predicts what comes NEXT, from here on.",
                 lambda r_v, fell, window: _labels(r_v, fell, window, first=1 - window),
             ),
             Mistake(
-                "sum for mean",
-                "a label lies in [0, 1].",
+                "sum for mean: a label lies in [0, 1].",
                 lambda r_v, fell, window: np.array(
                     [np.where(fell, 0, r_v)[t : t + window].sum() for t in range(len(r_v))]
                 ),
             ),
             Mistake(
-                "a window one step short",
-                "it ends before step t + window - 1.",
+                "a window one step short: it ends before step t + window - 1.",
                 lambda r_v, fell, window: _labels(r_v, fell, window - 1),
             ),
         ),
@@ -155,28 +146,26 @@ QUESTIONS = (
         truth=_returns,
         mistakes=(
             Mistake(
-                "a return that crosses a reset",
-                "after done a new episode begins, whose rewards this one did not earn.",
+                "a return that crosses a reset: after done a new episode begins, whose rewards "
+                "this one did not earn.",
                 lambda r, done, g: _returns(r, done & False, g),
             ),
             Mistake(
-                "a discount too early",
-                "the step's own reward counts in full: only what follows is discounted.",
+                "a discount too early: the step's own reward counts in full: only what follows is "
+                "discounted.",
                 lambda r, done, g: g * _returns(r, done, g),
             ),
             Mistake(
-                "a forgotten discount",
-                "each later reward counts gamma times less.",
+                "a forgotten discount: each later reward counts gamma times less.",
                 lambda r, done, g: _returns(r, done, 1.0),
             ),
             Mistake(
-                "an episode that ends one step early",
-                "the reward of the done step itself still belongs to the episode before it.",
+                "an episode that ends one step early: the reward of the done step itself still "
+                "belongs to the episode before it.",
                 lambda r, done, g: _returns(r, np.append(done[1:], False), g),
             ),
             Mistake(
-                "a sum of the past",
-                "returns look ahead: begin at the last step and go backwards.",
+                "a sum of the past: returns look ahead: begin at the last step and go backwards.",
                 lambda r, done, g: _returns(r[::-1], np.append(done[:-1][::-1], True), g)[::-1],
             ),
         ),
@@ -191,8 +180,7 @@ QUESTIONS = (
         points=2,
         title="PPO's objective",
         expects="the mean over samples of min(ratio * A, clip(ratio, 1 - eps, 1 + eps) * A): no "
-        "gain "
-        "from moving further than eps, but every loss is felt.",
+        "gain from moving further than eps, but every loss is felt.",
         draw=_ratios,
         truth=lambda ratio, advantage, epsilon: np.mean(
             np.where(
@@ -203,28 +191,25 @@ QUESTIONS = (
         ),
         mistakes=(
             Mistake(
-                "max for min",
-                "the bound must be pessimistic: the smaller of the two counts.",
+                "max for min: the bound must be pessimistic: the smaller of the two counts.",
                 lambda r, a, e: np.maximum(r * a, np.clip(r, 1 - e, 1 + e) * a).mean(),
             ),
             Mistake(
-                "a forgotten clip",
-                "nothing stops one update from moving the policy far away.",
+                "a forgotten clip: nothing stops one update from moving the policy far away.",
                 lambda r, a, e: (r * a).mean(),
             ),
             Mistake(
-                "the clipped term alone",
-                "without the min, a policy that has moved the wrong way is not called back.",
+                "the clipped term alone: without the min, a policy that has moved the wrong way is "
+                "not called back.",
                 lambda r, a, e: (np.clip(r, 1 - e, 1 + e) * a).mean(),
             ),
             Mistake(
-                "sum for mean",
-                "the objective must not grow with the batch.",
+                "sum for mean: the objective must not grow with the batch.",
                 lambda r, a, e: np.minimum(r * a, np.clip(r, 1 - e, 1 + e) * a).sum(),
             ),
             Mistake(
-                "a loss for an objective",
-                "the sign is turned: the objective is what PPO makes large.",
+                "a loss for an objective: the sign is turned: the objective is what PPO makes "
+                "large.",
                 lambda r, a, e: -np.minimum(r * a, np.clip(r, 1 - e, 1 + e) * a).mean(),
             ),
         ),

@@ -6,17 +6,17 @@ from fgtutor.course.checks.question import Mistake, Question
 from fgtutor.directions import NUM_HEADINGS, STEPS
 
 
-def _points(dice: np.random.Generator) -> tuple:
-    origin = dice.uniform(-3, 3, 2)
-    resolution = float(dice.choice([0.05, 0.1, 0.25]))
-    cells = dice.integers(-3, 20, (8, 2))
+def _points(rng: np.random.Generator) -> tuple:
+    origin = rng.uniform(-3, 3, 2)
+    resolution = float(rng.choice([0.05, 0.1, 0.25]))
+    cells = rng.integers(-3, 20, (8, 2))
     cells[0] = -2, -1  # one point beyond the map's lower left corner, always
     # Well inside their cells: on a border, rounding decides.
-    return origin + (cells + dice.uniform(0.15, 0.85, (8, 2))) * resolution, origin, resolution
+    return origin + (cells + rng.uniform(0.15, 0.85, (8, 2))) * resolution, origin, resolution
 
 
-def _patch(dice: np.random.Generator) -> tuple:
-    patch = dice.uniform(-2, 2) + dice.exponential(0.2, (7, 5))
+def _patch(rng: np.random.Generator) -> tuple:
+    patch = rng.uniform(-2, 2) + rng.exponential(0.2, (7, 5))
     footprint = np.zeros((7, 5), dtype=bool)
     footprint[2:5, 1:4] = True
     return patch, footprint
@@ -46,29 +46,25 @@ QUESTIONS = (
         truth=lambda xy, origin, resolution: np.floor((xy - origin) / resolution).astype(int),
         mistakes=(
             Mistake(
-                "rounding for floor",
-                "the origin is a cell's corner, not its centre, so no cell begins half a cell "
-                "early.",
+                "rounding for floor: the origin is a cell's corner, not its centre, so no cell "
+                "begins half a cell early.",
                 lambda xy, o, r: np.round((xy - o) / r).astype(int),
             ),
             Mistake(
-                "a forgotten origin",
-                "the map does not begin at (0, 0): subtract its corner first.",
+                "a forgotten origin: the map does not begin at (0, 0): subtract its corner first.",
                 lambda xy, o, r: np.floor(xy / r).astype(int),
             ),
             Mistake(
-                "swapped axes",
-                "x comes first: arrays here are [ix, iy], not [row, column].",
+                "swapped axes: x comes first: arrays here are [ix, iy], not [row, column].",
                 lambda xy, o, r: np.floor((xy - o) / r).astype(int)[:, ::-1],
             ),
             Mistake(
-                "truncation for floor",
-                "int() cuts towards zero, so points just left of the map land in cell 0.",
+                "truncation for floor: int() cuts towards zero, so points just left of the map "
+                "land in cell 0.",
                 lambda xy, o, r: ((xy - o) / r).astype(int),
             ),
             Mistake(
-                "a product for a quotient",
-                "metres divided by metres a cell gives cells.",
+                "a product for a quotient: metres divided by metres a cell gives cells.",
                 lambda xy, o, r: np.floor((xy - o) * r).astype(int),
             ),
         ),
@@ -84,34 +80,31 @@ QUESTIONS = (
         points=2,
         title="heights relative to the ground",
         expects="the median of the cells under the footprint is 0 after the subtraction, and "
-        "height "
-        "differences within the patch are unchanged.",
+        "height differences within the patch are unchanged.",
         draw=_patch,
         truth=lambda patch, footprint: patch - np.median(patch[footprint]),
         mistakes=(
             Mistake(
-                "mean for median",
-                "one high cell under a foot would lift the whole ground.",
+                "mean for median: one high cell under a foot would lift the whole ground.",
                 lambda patch, under: patch - patch[under].mean(),
             ),
             Mistake(
-                "the whole patch for the footprint",
-                "a wall ahead is no ground: only cells under the robot count.",
+                "the whole patch for the footprint: a wall ahead is no ground: only cells under "
+                "the robot count.",
                 lambda patch, under: patch - np.median(patch),
             ),
             Mistake(
-                "the middle cell alone",
-                "a single cell may be a stone: take the median under the footprint.",
+                "the middle cell alone: a single cell may be a stone: take the median under the "
+                "footprint.",
                 lambda patch, under: patch - patch[3, 2],
             ),
             Mistake(
-                "the lowest cell for the median",
-                "the ground is the median height under the robot.",
+                "the lowest cell for the median: the ground is the median height under the robot.",
                 lambda patch, under: patch - patch[under].min(),
             ),
             Mistake(
-                "absolute heights",
-                "nothing was subtracted: the same step looks different on every floor.",
+                "absolute heights: nothing was subtracted: the same step looks different on every "
+                "floor.",
                 lambda patch, under: patch,
             ),
         ),
@@ -127,33 +120,31 @@ QUESTIONS = (
         title="where the points of a patch lie",
         expects="offsets (ahead, left) are turned counter-clockwise by the yaw, then moved to the "
         "robot: at yaw 90 degrees, ahead is +y and left is -x.",
-        draw=lambda dice: (dice.uniform(-1, 1, (6, 2)), dice.uniform(-3, 3, 3)),
+        draw=lambda rng: (rng.uniform(-1, 1, (6, 2)), rng.uniform(-3, 3, 3)),
         examples=((np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([2.0, 3.0, np.pi / 2])),),
         truth=lambda offsets, pose: _turned(offsets, pose),
         mistakes=(
             Mistake(
-                "a clockwise turn",
-                "the signs of the two sines have changed places; yaw counts counter-clockwise.",
+                "a clockwise turn: the signs of the two sines have changed places; yaw counts "
+                "counter-clockwise.",
                 lambda offsets, pose: _turned(offsets, pose * (1, 1, -1)),
             ),
             Mistake(
-                "a forgotten position",
-                "the points turn about the robot, and then lie around it, not around (0, 0).",
+                "a forgotten position: the points turn about the robot, and then lie around it, "
+                "not around (0, 0).",
                 lambda offsets, pose: _turned(offsets, pose * (0, 0, 1)),
             ),
             Mistake(
-                "a forgotten turn",
-                "the patch looks along +x whatever the yaw is.",
+                "a forgotten turn: the patch looks along +x whatever the yaw is.",
                 lambda offsets, pose: _turned(offsets, pose * (1, 1, 0)),
             ),
             Mistake(
-                "turned after moving",
-                "turn the offsets first, then add the position; the position is not turned.",
+                "turned after moving: turn the offsets first, then add the position; the position "
+                "is not turned.",
                 lambda offsets, pose: _turned(offsets + pose[:2], pose * (0, 0, 1)),
             ),
             Mistake(
-                "radians taken for degrees",
-                "the yaw is in radians already.",
+                "radians taken for degrees: the yaw is in radians already.",
                 lambda offsets, pose: _turned(offsets, pose * (1, 1, np.pi / 180)),
             ),
         ),
@@ -170,9 +161,9 @@ QUESTIONS = (
         title="up or down depends on the heading",
         expects="rise[ix, iy] is the height of the neighbour along the heading minus the height of "
         "the cell itself, and NaN where that neighbour is off the map.",
-        draw=lambda dice: (
-            dice.uniform(0, 1, (int(dice.integers(4, 7)), int(dice.integers(3, 6)))),
-            int(dice.integers(NUM_HEADINGS)),
+        draw=lambda rng: (
+            rng.uniform(0, 1, (int(rng.integers(4, 7)), int(rng.integers(3, 6)))),
+            int(rng.integers(NUM_HEADINGS)),
         ),
         examples=(
             (np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.2, 0.2, 0.2]]), 0),
@@ -181,33 +172,28 @@ QUESTIONS = (
         truth=lambda heights, heading: _rise(heights, STEPS[heading]),
         mistakes=(
             Mistake(
-                "a reversed difference",
-                "it is the neighbour minus the cell: going up is positive.",
+                "a reversed difference: it is the neighbour minus the cell: going up is positive.",
                 lambda heights, k: -_rise(heights, STEPS[k]),
             ),
             Mistake(
-                "the opposite heading",
-                "it looks at the neighbour behind.",
+                "the opposite heading: it looks at the neighbour behind.",
                 lambda heights, k: _rise(heights, -STEPS[k]),
             ),
             Mistake(
-                "swapped axes",
-                "STEPS[k] is (dix, diy), and the first index of heights is ix.",
+                "swapped axes: STEPS[k] is (dix, diy), and the first index of heights is ix.",
                 lambda heights, k: _rise(heights, STEPS[k][::-1]),
             ),
             Mistake(
-                "a map that wraps around",
-                "np.roll brings the far border back in: off the map there is no neighbour.",
+                "a map that wraps around: np.roll brings the far border back in: off the map there "
+                "is no neighbour.",
                 lambda heights, k: np.roll(heights, tuple(-STEPS[k]), (0, 1)) - heights,
             ),
             Mistake(
-                "zeros beyond the border",
-                "a rise of 0 says flat ground; what is not known is NaN.",
+                "zeros beyond the border: a rise of 0 says flat ground; what is not known is NaN.",
                 lambda heights, k: _rise(heights, STEPS[k], outside=0.0),
             ),
             Mistake(
-                "a heading off by one",
-                "heading 0 is +x, 1 is +x+y, and so on counter-clockwise.",
+                "a heading off by one: heading 0 is +x, 1 is +x+y, and so on counter-clockwise.",
                 lambda heights, k: _rise(heights, STEPS[(k + 1) % NUM_HEADINGS]),
             ),
         ),

@@ -6,21 +6,21 @@ from fgtutor.course.checks.question import Mistake, Question
 from fgtutor.directions import STEP_LENGTHS, STEPS
 
 
-def _tensors(dice: np.random.Generator) -> tuple:
+def _tensors(rng: np.random.Generator) -> tuple:
     # One decimal, so that policies tie here and there.
-    return (dice.uniform(0, 1, (3, 4, 3, 8)).round(1),)
+    return (rng.uniform(0, 1, (3, 4, 3, 8)).round(1),)
 
 
-def _fused(dice: np.random.Generator) -> tuple:
-    fused = dice.uniform(0, 1, (3, 4, 8))
+def _fused(rng: np.random.Generator) -> tuple:
+    fused = rng.uniform(0, 1, (3, 4, 8))
     fused[0, 0, :2] = 0.0, 0.2
     return fused, 0.2
 
 
-def _costs(dice: np.random.Generator) -> tuple:
-    costs = 1 / dice.uniform(0.12, 1, (5, 4, 8))
-    costs[dice.uniform(size=costs.shape) < 0.25] = np.inf
-    return costs, (0, int(dice.integers(4))), (4, int(dice.integers(4)))
+def _costs(rng: np.random.Generator) -> tuple:
+    costs = 1 / rng.uniform(0.12, 1, (5, 4, 8))
+    costs[rng.uniform(size=costs.shape) < 0.25] = np.inf
+    return costs, (0, int(rng.integers(4))), (4, int(rng.integers(4)))
 
 
 def _cheapest(costs: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> float:
@@ -57,11 +57,11 @@ def _both_ways(costs: np.ndarray, start: tuple[int, int], goal: tuple[int, int])
     return _cheapest(np.minimum(costs, np.stack(back, axis=-1)), start, goal)
 
 
-def _route(dice: np.random.Generator) -> tuple:
-    fused = dice.uniform(0.1, 1, (6, 6, 8))
+def _route(rng: np.random.Generator) -> tuple:
+    fused = rng.uniform(0.1, 1, (6, 6, 8))
     cells = [np.array([2, 3])]
     while len(cells) < 6:
-        onward = cells[-1] + STEPS[dice.integers(8)]
+        onward = cells[-1] + STEPS[rng.integers(8)]
         if ((onward >= 0) & (onward < 6)).all():
             cells.append(onward)
     return fused, np.array(cells)
@@ -85,39 +85,34 @@ QUESTIONS = (
         points=2,
         title="the best policy, and how good it is",
         expects="fused[x, y, k] is the largest F_i[x, y, k] over the policies i, and the policy "
-        "map "
-        "the number of that policy (of the first, where they tie).",
+        "map the number of that policy (of the first, where they tie).",
         draw=_tensors,
         truth=lambda tensors: (tensors.max(axis=0), tensors.argmax(axis=0)),
         mistakes=(
             Mistake(
-                "mean for max",
-                "a good policy is not made worse by bad colleagues.",
+                "mean for max: a good policy is not made worse by bad colleagues.",
                 lambda t: (t.mean(axis=0), t.argmax(axis=0)),
             ),
             Mistake(
-                "argmin for argmax",
-                "F is feasibility: high is good.",
+                "argmin for argmax: F is feasibility: high is good.",
                 lambda t: (t.max(axis=0), t.argmin(axis=0)),
             ),
             Mistake(
-                "max for argmax",
-                "the policy map holds the NUMBER of the best policy, not its value.",
+                "max for argmax: the policy map holds the NUMBER of the best policy, not its "
+                "value.",
                 lambda t: (t.max(axis=0), t.max(axis=0)),
             ),
             Mistake(
-                "the best heading for the best policy",
-                "it compares along the headings (axis -1); policies are the first axis.",
+                "the best heading for the best policy: it compares along the headings (axis -1); "
+                "policies are the first axis.",
                 lambda t: (t.max(axis=-1), t.argmax(axis=-1)),
             ),
             Mistake(
-                "the last of equals",
-                "where policies tie, the first is taken.",
+                "the last of equals: where policies tie, the first is taken.",
                 lambda t: (t.max(axis=0), len(t) - 1 - t[::-1].argmax(axis=0)),
             ),
             Mistake(
-                "swapped answers",
-                "the fused tensor comes first, then the policy map.",
+                "swapped answers: the fused tensor comes first, then the policy map.",
                 lambda t: (t.argmax(axis=0), t.max(axis=0)),
             ),
         ),
@@ -137,28 +132,26 @@ QUESTIONS = (
         truth=lambda fused, f_min: np.where(fused >= f_min, 1 / fused, np.inf),
         mistakes=(
             Mistake(
-                "1 - F for 1 / F",
-                "the paper takes the inverse: a hardly feasible step must cost far more.",
+                "1 - F for 1 / F: the paper takes the inverse: a hardly feasible step must cost "
+                "far more.",
                 lambda f, m: np.where(f >= m, 1 - f, np.inf),
             ),
             Mistake(
-                "edges that should be closed",
-                "below f_min there is no edge, whatever it would cost.",
+                "edges that should be closed: below f_min there is no edge, whatever it would "
+                "cost.",
                 lambda f, m: 1 / f,
             ),
             Mistake(
-                "an edge closed at f_min",
-                "F >= f_min is open: exactly f_min too.",
+                "an edge closed at f_min: F >= f_min is open: exactly f_min too.",
                 lambda f, m: np.where(f > m, 1 / f, np.inf),
             ),
             Mistake(
-                "closed edges for free",
-                "0 is the CHEAPEST cost there is; a closed edge costs infinity.",
+                "closed edges for free: 0 is the CHEAPEST cost there is; a closed edge costs "
+                "infinity.",
                 lambda f, m: np.where(f >= m, 1 / f, 0.0),
             ),
             Mistake(
-                "feasibility for cost",
-                "high F is good, high cost is bad.",
+                "feasibility for cost: high F is good, high cost is bad.",
                 lambda f, m: np.where(f >= m, f, np.inf),
             ),
         ),
@@ -173,34 +166,29 @@ QUESTIONS = (
         points=3,
         title="Dijkstra",
         expects="the cost of the cheapest chain of edges from start to goal, where costs[ix, iy, "
-        "k] is "
-        "paid for LEAVING a cell along heading k; infinity if no chain joins them.",
+        "k] is paid for LEAVING a cell along heading k; infinity if no chain joins them.",
         draw=_costs,
         truth=_cheapest,
         mistakes=(
             Mistake(
-                "a search for the fewest steps",
-                "a longer way over easy ground may be cheaper.",
+                "a search for the fewest steps: a longer way over easy ground may be cheaper.",
                 _fewest_steps,
             ),
             Mistake(
-                "the way back",
-                "it leads from goal to start: up a step is not down a step.",
+                "the way back: it leads from goal to start: up a step is not down a step.",
                 lambda costs, start, goal: _cheapest(costs, goal, start),
             ),
             Mistake(
-                "an undirected graph",
-                "an edge and its reverse have costs of their own: use a DiGraph.",
+                "an undirected graph: an edge and its reverse have costs of their own: use a "
+                "DiGraph.",
                 _both_ways,
             ),
             Mistake(
-                "costs times step length",
-                "the paper's edge cost is 1 / F for diagonals too.",
+                "costs times step length: the paper's edge cost is 1 / F for diagonals too.",
                 lambda costs, start, goal: _cheapest(costs * STEP_LENGTHS, start, goal),
             ),
             Mistake(
-                "a heading off by one",
-                "costs[..., k] belongs to STEPS[k].",
+                "a heading off by one: costs[..., k] belongs to STEPS[k].",
                 lambda costs, start, goal: _cheapest(np.roll(costs, 1, axis=-1), start, goal),
             ),
         ),
@@ -216,39 +204,31 @@ QUESTIONS = (
         points=2,
         title="what does a route cost?",
         expects="the sum over its steps of 1 / F of the cell that is LEFT, along the step's "
-        "heading: a "
-        "route of n cells has n - 1 steps.",
+        "heading: a route of n cells has n - 1 steps.",
         draw=_route,
         truth=lambda fused, cells: (1 / _edges(fused, cells)).sum(),
         mistakes=(
             Mistake(
-                "the cell that is entered",
-                "F[ix, iy, k] is the feasibility of LEAVING (ix, iy).",
+                "the cell that is entered: F[ix, iy, k] is the feasibility of LEAVING (ix, iy).",
                 lambda f, c: (1 / _edges(f, c, late=1)).sum(),
             ),
             Mistake(
-                "the opposite heading",
-                "the step leads from cells[i] to cells[i + 1], not back.",
+                "the opposite heading: the step leads from cells[i] to cells[i + 1], not back.",
                 lambda f, c: (1 / _edges(f, c, turn=4)).sum(),
             ),
             Mistake(
-                "a heading off by one",
-                "heading 0 is +x.",
+                "a heading off by one: heading 0 is +x.",
                 lambda f, c: (1 / _edges(f, c, turn=1)).sum(),
             ),
             Mistake(
-                "the inverse of the sum",
-                "sum the costs of the steps, not their feasibilities.",
+                "the inverse of the sum: sum the costs of the steps, not their feasibilities.",
                 lambda f, c: 1 / _edges(f, c).sum(),
             ),
             Mistake(
-                "mean for sum",
-                "every step has to be paid.",
-                lambda f, c: (1 / _edges(f, c)).mean(),
+                "mean for sum: every step has to be paid.", lambda f, c: (1 / _edges(f, c)).mean()
             ),
             Mistake(
-                "costs times step length",
-                "the paper's edge cost is 1 / F for diagonals too.",
+                "costs times step length: the paper's edge cost is 1 / F for diagonals too.",
                 lambda f, c: (_lengths(c) / _edges(f, c)).sum(),
             ),
         ),

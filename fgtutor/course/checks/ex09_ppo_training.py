@@ -7,11 +7,11 @@ from fgtutor.course.checks.question import Mistake, Question
 UP, DOWN = 0.5, 0.3
 
 
-def _robots(dice: np.random.Generator) -> tuple:
-    last = int(dice.integers(4, 8))
-    row = dice.integers(0, last + 1, 10)
-    mean = dice.uniform(0, 1, 10)
-    failed = dice.uniform(size=10) < 0.4
+def _robots(rng: np.random.Generator) -> tuple:
+    last = int(rng.integers(4, 8))
+    row = rng.integers(0, last + 1, 10)
+    mean = rng.uniform(0, 1, 10)
+    failed = rng.uniform(size=10) < 0.4
     # The cases that decide: top, bottom, middle band, a good robot that fell.
     row[:4], mean[:4], failed[:4] = (last, 0, 2, 2), (0.9, 0.1, 0.4, 0.8), (0, 0, 0, 1)
     return row, mean, failed, last
@@ -21,11 +21,11 @@ def _moves(mean: np.ndarray, failed: np.ndarray) -> np.ndarray:
     return ((mean > UP) & ~failed).astype(int) - ((mean < DOWN) | failed).astype(int)
 
 
-def _rollout(dice: np.random.Generator) -> tuple:
+def _rollout(rng: np.random.Generator) -> tuple:
     done = np.zeros(8, dtype=bool)
-    done[dice.integers(2, 6)] = True
-    gamma, lam = float(dice.uniform(0.9, 0.99)), float(dice.uniform(0.8, 0.97))
-    return dice.uniform(0, 1, 8), dice.uniform(0, 5, 9), done, gamma, lam
+    done[rng.integers(2, 6)] = True
+    gamma, lam = float(rng.uniform(0.9, 0.99)), float(rng.uniform(0.8, 0.97))
+    return rng.uniform(0, 1, 8), rng.uniform(0, 5, 9), done, gamma, lam
 
 
 def _advantages(
@@ -62,39 +62,34 @@ QUESTIONS = (
         name="next_rows",
         points=2,
         title="a curriculum in one line",
-        expects="one row up if mean r_v > 0.5 and the robot did not fall; one row down if mean "
-        "r_v < "
-        "0.3 or it fell; rows stay within 0 ... last.",
+        expects="one row up if mean r_v > 0.5 and the robot did not fall; one row down if mean r_v "
+        "< 0.3 or it fell; rows stay within 0 ... last.",
         draw=_robots,
         truth=lambda row, mean_r_v, failed, last: np.clip(row + _moves(mean_r_v, failed), 0, last),
         mistakes=(
             Mistake(
-                "promoting the fallen",
-                "a robot that ran well until it fell has not mastered its row.",
+                "promoting the fallen: a robot that ran well until it fell has not mastered its "
+                "row.",
                 lambda row, mean, failed, last: np.clip(
                     row + (mean > UP).astype(int) - (mean < DOWN), 0, last
                 ),
             ),
             Mistake(
-                "a forgotten clip",
-                "below row 0 and above the last there is no terrain.",
+                "a forgotten clip: below row 0 and above the last there is no terrain.",
                 lambda row, mean, failed, last: row + _moves(mean, failed),
             ),
             Mistake(
-                "no patience between the bounds",
-                "between 0.3 and 0.5 a robot stays where it is.",
+                "no patience between the bounds: between 0.3 and 0.5 a robot stays where it is.",
                 lambda row, mean, failed, last: np.clip(
                     row + np.where((mean > UP) & ~failed, 1, -1), 0, last
                 ),
             ),
             Mistake(
-                "up and down exchanged",
-                "who does well moves on to harder ground.",
+                "up and down exchanged: who does well moves on to harder ground.",
                 lambda row, mean, failed, last: np.clip(row - _moves(mean, failed), 0, last),
             ),
             Mistake(
-                "no way down",
-                "a robot stuck on ground too hard for it learns nothing.",
+                "no way down: a robot stuck on ground too hard for it learns nothing.",
                 lambda row, mean, failed, last: np.clip(row + ((mean > UP) & ~failed), 0, last),
             ),
         ),
@@ -114,28 +109,25 @@ QUESTIONS = (
         truth=_advantages,
         mistakes=(
             Mistake(
-                "an advantage that crosses a reset",
-                "after done comes another robot's life.",
+                "an advantage that crosses a reset: after done comes another robot's life.",
                 lambda r, v, done, g, lam: _advantages(r, v, done & False, g, lam),
             ),
             Mistake(
-                "a forgotten lambda",
-                "each later surprise counts gamma * lam times less.",
+                "a forgotten lambda: each later surprise counts gamma * lam times less.",
                 lambda r, v, done, g, lam: _advantages(r, v, done, g, 1.0),
             ),
             Mistake(
-                "one step alone",
-                "that is d_t, the case lam = 0: later surprises count too.",
+                "one step alone: that is d_t, the case lam = 0: later surprises count too.",
                 lambda r, v, done, g, lam: _advantages(r, v, done, g, 0.0),
             ),
             Mistake(
-                "returns for advantages",
-                "V_t was added again: that is what the critic learns, not the policy.",
+                "returns for advantages: V_t was added again: that is what the critic learns, not "
+                "the policy.",
                 lambda r, v, done, g, lam: _advantages(r, v, done, g, lam) + v[:-1],
             ),
             Mistake(
-                "rewards without the critic",
-                "the values are missing: d_t = r_t + gamma V_(t+1) - V_t.",
+                "rewards without the critic: the values are missing: d_t = r_t + gamma V_(t+1) - "
+                "V_t.",
                 lambda r, v, done, g, lam: _advantages(r, 0 * v, done, g, lam),
             ),
         ),
@@ -149,12 +141,11 @@ QUESTIONS = (
         name="next_rate",
         points=2,
         title="a learning rate that follows the KL",
-        expects="the rate is divided by 1.5 if KL > 2 desired, multiplied by 1.5 if KL < desired "
-        "/ 2, "
-        "else kept; always within 1e-5 ... 1e-2.",
-        draw=lambda dice: (
-            float(10 ** dice.uniform(-4.9, -2.1)),
-            float(0.01 * 10 ** dice.uniform(-1, 1)),
+        expects="the rate is divided by 1.5 if KL > 2 desired, multiplied by 1.5 if KL < desired / "
+        "2, else kept; always within 1e-5 ... 1e-2.",
+        draw=lambda rng: (
+            float(10 ** rng.uniform(-4.9, -2.1)),
+            float(0.01 * 10 ** rng.uniform(-1, 1)),
             0.01,
         ),
         examples=(
@@ -167,25 +158,21 @@ QUESTIONS = (
         truth=lambda rate, kl, desired: _rate(rate, kl, desired),
         mistakes=(
             Mistake(
-                "a turned rule",
-                "a large KL says that the last step was too LONG.",
+                "a turned rule: a large KL says that the last step was too LONG.",
                 lambda rate, kl, desired: _rate(rate, kl, desired, slower=1 / 1.5),
             ),
             Mistake(
-                "a forgotten limit",
-                "without 1e-5 ... 1e-2 the rate can vanish or explode.",
+                "a forgotten limit: without 1e-5 ... 1e-2 the rate can vanish or explode.",
                 _unlimited,
             ),
             Mistake(
-                "no band of peace",
-                "between desired / 2 and 2 desired the rate is kept.",
+                "no band of peace: between desired / 2 and 2 desired the rate is kept.",
                 lambda rate, kl, desired: min(
                     max(rate / 1.5 if kl > desired else rate * 1.5, 1e-5), 1e-2
                 ),
             ),
             Mistake(
-                "a rate that never recovers",
-                "a small KL allows longer steps again.",
+                "a rate that never recovers: a small KL allows longer steps again.",
                 lambda rate, kl, desired: max(rate / 1.5, 1e-5) if kl > 2 * desired else rate,
             ),
         ),

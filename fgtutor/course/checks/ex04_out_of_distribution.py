@@ -5,16 +5,16 @@ import numpy as np
 from fgtutor.course.checks.question import Mistake, Question
 
 
-def _patches(dice: np.random.Generator) -> tuple:
-    n, points = dice.integers(3, 6), dice.integers(4, 9)
-    patch = dice.normal(0, 0.1, (n, points))
-    return patch, 4 * patch + dice.normal(0, 0.2, (n, points)), float(dice.choice([2.0, 4.0, 5.0]))
+def _patches(rng: np.random.Generator) -> tuple:
+    n, points = rng.integers(3, 6), rng.integers(4, 9)
+    patch = rng.normal(0, 0.1, (n, points))
+    return patch, 4 * patch + rng.normal(0, 0.2, (n, points)), float(rng.choice([2.0, 4.0, 5.0]))
 
 
-def _losses(dice: np.random.Generator) -> tuple:
-    low = float(dice.uniform(0.05, 0.5))
-    high = low + float(dice.uniform(0.5, 3.0))
-    return dice.uniform(0, high + 1, (4, 5)), low, high
+def _losses(rng: np.random.Generator) -> tuple:
+    low = float(rng.uniform(0.05, 0.5))
+    high = low + float(rng.uniform(0.5, 3.0))
+    return rng.uniform(0, high + 1, (4, 5)), low, high
 
 
 def _weight(loss: np.ndarray, tau_low: float, tau_high: float) -> np.ndarray:
@@ -39,33 +39,32 @@ QUESTIONS = (
         ),
         mistakes=(
             Mistake(
-                "mean for sum",
-                "the errors are averaged over the points, so tau = 0.1 and 2.0 lose their meaning.",
+                "mean for sum: the errors are averaged over the points, so tau = 0.1 and 2.0 lose "
+                "their meaning.",
                 lambda x, y, s: ((s * x - y) ** 2).mean(axis=-1),
             ),
             Mistake(
-                "a forgotten scale",
-                "the patch is compared in metres, but the decoder speaks in scaled heights.",
+                "a forgotten scale: the patch is compared in metres, but the decoder speaks in "
+                "scaled heights.",
                 lambda x, y, s: ((x - y) ** 2).sum(axis=-1),
             ),
             Mistake(
-                "the sum over the wrong axis",
-                "it sums over the patches of the batch; each patch keeps a loss of its own.",
+                "the sum over the wrong axis: it sums over the patches of the batch; each patch "
+                "keeps a loss of its own.",
                 lambda x, y, s: ((s * x - y) ** 2).sum(axis=0),
             ),
             Mistake(
-                "one number for the whole batch",
-                "it sums over patches too; each patch keeps a loss of its own (axis=-1).",
+                "one number for the whole batch: it sums over patches too; each patch keeps a loss "
+                "of its own (axis=-1).",
                 lambda x, y, s: ((s * x - y) ** 2).sum(),
             ),
             Mistake(
-                "absolute for squared errors",
-                "the errors are not squared.",
+                "absolute for squared errors: the errors are not squared.",
                 lambda x, y, s: np.abs(s * x - y).sum(axis=-1),
             ),
             Mistake(
-                "a root too many",
-                "the square root is taken: L_recon is the squared distance itself.",
+                "a root too many: the square root is taken: L_recon is the squared distance "
+                "itself.",
                 lambda x, y, s: np.sqrt(((s * x - y) ** 2).sum(axis=-1)),
             ),
         ),
@@ -86,28 +85,26 @@ QUESTIONS = (
         truth=_weight,
         mistakes=(
             Mistake(
-                "swapped taus, or a forgotten '1 -' (both come to the same)",
-                "it grows with the loss, so that unknown terrain gets the weight 1.",
+                "swapped taus, or a forgotten '1 -' (both come to the same): it grows with the "
+                "loss, so that unknown terrain gets the weight 1.",
                 lambda loss, low, high: np.clip((loss - low) / (high - low), 0, 1),
             ),
             Mistake(
-                "a forgotten clip",
-                "below tau_low it exceeds 1, and above tau_high it is negative.",
+                "a forgotten clip: below tau_low it exceeds 1, and above tau_high it is negative.",
                 lambda loss, low, high: 1 - (loss - low) / (high - low),
             ),
             Mistake(
-                "half a clip",
-                "it stops at 0, but below tau_low it exceeds 1.",
+                "half a clip: it stops at 0, but below tau_low it exceeds 1.",
                 lambda loss, low, high: np.maximum(1 - (loss - low) / (high - low), 0),
             ),
             Mistake(
-                "a hard threshold",
-                "it jumps from 1 to 0 at tau_high; between the taus it should fall gradually.",
+                "a hard threshold: it jumps from 1 to 0 at tau_high; between the taus it should "
+                "fall gradually.",
                 lambda loss, low, high: np.where(loss < high, 1.0, 0.0),
             ),
             Mistake(
-                "division by tau_high alone",
-                "the ramp must span tau_high - tau_low, so that it reaches 0 at tau_high.",
+                "division by tau_high alone: the ramp must span tau_high - tau_low, so that it "
+                "reaches 0 at tau_high.",
                 lambda loss, low, high: np.clip(1 - (loss - low) / high, 0, 1),
             ),
         ),
@@ -123,37 +120,33 @@ QUESTIONS = (
         points=2,
         title="thresholds from a specialist's own terrain",
         expects="tau_low is the 90 % and tau_high twice the 99 % quantile of the own L_recon.",
-        draw=lambda dice: (dice.lognormal(-1, 0.8, dice.integers(60, 200)),),
+        draw=lambda rng: (rng.lognormal(-1, 0.8, rng.integers(60, 200)),),
         truth=lambda losses: tuple(np.quantile(losses, (0.9, 0.99)) * (1, 2)),
         mistakes=(
             Mistake(
-                "the wrong tail",
-                "q10 and q5 are losses of the MOST familiar patches.",
+                "the wrong tail: q10 and q5 are losses of the MOST familiar patches.",
                 lambda losses: tuple(np.quantile(losses, (0.1, 0.05)) * (1, 2)),
             ),
             Mistake(
-                "swapped taus",
-                "tau_low comes first and is the smaller one.",
+                "swapped taus: tau_low comes first and is the smaller one.",
                 lambda losses: tuple(np.quantile(losses, (0.99, 0.9)) * (2, 1)),
             ),
             Mistake(
-                "a forgotten factor",
-                "tau_high is TWICE the 99 % quantile: no hundredth of the own terrain closes.",
+                "a forgotten factor: tau_high is TWICE the 99 % quantile: no hundredth of the own "
+                "terrain closes.",
                 lambda losses: tuple(np.quantile(losses, (0.9, 0.99))),
             ),
             Mistake(
-                "shares of the largest loss",
-                "0.9 * max is no quantile: one odd patch would move both thresholds.",
+                "shares of the largest loss: 0.9 * max is no quantile: one odd patch would move "
+                "both thresholds.",
                 lambda losses: (0.9 * losses.max(), 2 * 0.99 * losses.max()),
             ),
             Mistake(
-                "percent for shares",
-                "np.percentile counts to 100, np.quantile to 1.",
+                "percent for shares: np.percentile counts to 100, np.quantile to 1.",
                 lambda losses: tuple(np.percentile(losses, (0.9, 0.99)) * (1, 2)),
             ),
             Mistake(
-                "mean and standard deviation",
-                "losses are far from normal: use quantiles.",
+                "mean and standard deviation: losses are far from normal: use quantiles.",
                 lambda losses: (losses.mean() + losses.std(), losses.mean() + 2 * losses.std()),
             ),
         ),
@@ -169,35 +162,28 @@ QUESTIONS = (
         points=2,
         title="when does a good place close?",
         expects="the L_recon at which F = w_ood * f has fallen to f_min = 0.1, where f = 0.9 and "
-        "the "
-        "taus are the paper's 0.1 and 2.0.",
+        "the taus are the paper's 0.1 and 2.0.",
         truth=lambda: _ceiling(0.9, 0.1),
         mistakes=(
             Mistake(
-                "tau_high itself",
-                "there w_ood is 0; the place closes before, as soon as w_ood * f < f_min.",
+                "tau_high itself: there w_ood is 0; the place closes before, as soon as w_ood * f "
+                "< f_min.",
                 lambda: 2.0,
             ),
             Mistake(
-                "a forgotten f",
-                "w_ood need not fall to 0.1, only to 0.1 / f.",
+                "a forgotten f: w_ood need not fall to 0.1, only to 0.1 / f.",
                 lambda: _ceiling(1.0, 0.1),
             ),
             Mistake(
-                "the ramp read backwards",
-                "that is where w_ood has fallen BY 1/9, not TO 1/9.",
+                "the ramp read backwards: that is where w_ood has fallen BY 1/9, not TO 1/9.",
                 lambda: 0.1 + 1.9 / 9,
             ),
             Mistake(
-                "a ramp that starts at 0",
-                "w_ood begins to fall at tau_low = 0.1: add it.",
+                "a ramp that starts at 0: w_ood begins to fall at tau_low = 0.1: add it.",
                 lambda: 1.9 * (1 - 1 / 9),
             ),
         ),
-        hints=(
-            "Which w_ood makes w_ood * 0.9 = 0.1?",
-            "Solve 1 - (L - 0.1) / 1.9 = 1/9 for L.",
-        ),
+        hints=("Which w_ood makes w_ood * 0.9 = 0.1?", "Solve 1 - (L - 0.1) / 1.9 = 1/9 for L."),
         rtol=5e-3,
     ),
 )

@@ -6,9 +6,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from fgtutor.course.checks.question import Mistake, Question
 
 
-def _map_and_window(dice: np.random.Generator) -> tuple:
-    shape = (int(dice.integers(6, 9)), int(dice.integers(5, 8)))
-    return dice.normal(0, 1, shape), 3, 2
+def _map_and_window(rng: np.random.Generator) -> tuple:
+    shape = (int(rng.integers(6, 9)), int(rng.integers(5, 8)))
+    return rng.normal(0, 1, shape), 3, 2
 
 
 def _windows(heights: np.ndarray, rows: int, columns: int) -> np.ndarray:
@@ -16,28 +16,28 @@ def _windows(heights: np.ndarray, rows: int, columns: int) -> np.ndarray:
     return windows.reshape(*windows.shape[:2], rows * columns)
 
 
-def _layer_inputs(dice: np.random.Generator) -> tuple:
-    shape = (int(dice.integers(5, 9)), int(dice.integers(5, 9)))
-    return dice.normal(0, 1, shape), dice.normal(0, 1, (3, 3)), float(dice.normal(0, 1))
+def _layer_inputs(rng: np.random.Generator) -> tuple:
+    shape = (int(rng.integers(5, 9)), int(rng.integers(5, 9)))
+    return rng.normal(0, 1, shape), rng.normal(0, 1, (3, 3)), float(rng.normal(0, 1))
 
 
 def _layer(heights: np.ndarray, kernel: np.ndarray, bias: float) -> np.ndarray:
     return np.einsum("xyij,ij->xy", sliding_window_view(heights, kernel.shape), kernel) + bias
 
 
-def _tensor(dice: np.random.Generator) -> tuple:
-    shape = (int(dice.integers(3, 5)), int(dice.integers(5, 7)), 8)
-    return dice.uniform(0, 1, shape), int(dice.integers(1, 4))
+def _tensor(rng: np.random.Generator) -> tuple:
+    shape = (int(rng.integers(3, 5)), int(rng.integers(5, 7)), 8)
+    return rng.uniform(0, 1, shape), int(rng.integers(1, 4))
 
 
 def _turned(tensor: np.ndarray, quarter: int, shift: int) -> np.ndarray:
     return np.rot90(np.roll(tensor, shift, axis=-1), quarter, axes=(0, 1))
 
 
-def _decoder(dice: np.random.Generator) -> tuple:
+def _decoder(rng: np.random.Generator) -> tuple:
     n, points, latent = 5, 9, 3
-    decoder = dice.normal(0, 1, (points, latent))
-    aims, codes = dice.normal(0, 1, (n, points)), dice.normal(0, 1, (n, latent))
+    decoder = rng.normal(0, 1, (points, latent))
+    aims, codes = rng.normal(0, 1, (n, points)), rng.normal(0, 1, (n, latent))
     return codes, (aims**2).sum(axis=-1), aims @ decoder, decoder.T @ decoder
 
 
@@ -59,14 +59,13 @@ QUESTIONS = (
         points=2,
         title="the sliding window",
         expects="window [i, j] holds the rows x columns heights whose lowest corner is cell (i, "
-        "j), "
-        "flattened with y fastest; one window for every place where it fits.",
+        "j), flattened with y fastest; one window for every place where it fits.",
         draw=_map_and_window,
         truth=_windows,
         mistakes=(
             Mistake(
-                "a window read y first",
-                "x varies slowest in a flattened patch: rows follow one another as they lie.",
+                "a window read y first: x varies slowest in a flattened patch: rows follow one "
+                "another as they lie.",
                 lambda h, r, c: (
                     sliding_window_view(h, (r, c))
                     .swapaxes(-1, -2)
@@ -74,23 +73,20 @@ QUESTIONS = (
                 ),
             ),
             Mistake(
-                "one window too few",
-                "a map of nx cells holds nx - rows + 1 windows along x, not nx - rows.",
+                "one window too few: a map of nx cells holds nx - rows + 1 windows along x, not nx "
+                "- rows.",
                 lambda h, r, c: _windows(h, r, c)[:-1, :-1],
             ),
             Mistake(
-                "windows side by side",
-                "it jumps by whole windows; it should slide by one cell.",
+                "windows side by side: it jumps by whole windows; it should slide by one cell.",
                 lambda h, r, c: _windows(h, r, c)[::r, ::c],
             ),
             Mistake(
-                "a window turned on its side",
-                "rows run along x, the first axis; columns along y.",
+                "a window turned on its side: rows run along x, the first axis; columns along y.",
                 lambda h, r, c: _windows(h, c, r),
             ),
             Mistake(
-                "windows in swapped order",
-                "the first axis of the answer is i, along x.",
+                "windows in swapped order: the first axis of the answer is i, along x.",
                 lambda h, r, c: _windows(h, r, c).swapaxes(0, 1),
             ),
         ),
@@ -106,42 +102,35 @@ QUESTIONS = (
         points=3,
         title="one neuron of the first layer, everywhere at once",
         expects="the answer at (i, j) is the sum over the window of heights * kernel, plus the "
-        "bias "
-        "once: what that neuron says to the window at (i, j).",
+        "bias once: what that neuron says to the window at (i, j).",
         draw=_layer_inputs,
         truth=_layer,
         mistakes=(
             Mistake(
-                "a flipped kernel",
-                "that is the mathematician's convolution; a network correlates, without flipping.",
+                "a flipped kernel: that is the mathematician's convolution; a network correlates, "
+                "without flipping.",
                 lambda h, k, b: _layer(h, k[::-1, ::-1], b),
             ),
             Mistake(
-                "a transposed kernel",
-                "the first axis of the kernel runs along x, as that of the map.",
+                "a transposed kernel: the first axis of the kernel runs along x, as that of the "
+                "map.",
                 lambda h, k, b: _layer(h, k.T, b),
             ),
             Mistake(
-                "a forgotten bias",
-                "a linear layer adds its bias.",
-                lambda h, k, b: _layer(h, k, 0.0),
+                "a forgotten bias: a linear layer adds its bias.", lambda h, k, b: _layer(h, k, 0.0)
             ),
             Mistake(
-                "a bias for every point",
-                "the bias is added once, after the sum.",
+                "a bias for every point: the bias is added once, after the sum.",
                 lambda h, k, b: _layer(h, k, b * k.size),
             ),
             Mistake(
-                "mean for sum",
-                "a neuron sums its inputs.",
-                lambda h, k, b: _layer(h, k / k.size, b),
+                "mean for sum: a neuron sums its inputs.", lambda h, k, b: _layer(h, k / k.size, b)
             ),
         ),
         hints=(
             "For one window: (window * kernel).sum() + bias.",
             "Turn the loop inside out: for each kernel entry [i, j], add kernel[i, j] times the "
-            "map "
-            "shifted by (i, j). That is a convolution layer.",
+            "map shifted by (i, j). That is a convolution layer.",
         ),
     ),
     Question(
@@ -150,35 +139,30 @@ QUESTIONS = (
         points=2,
         title="turn the map, and the headings turn with it",
         expects="after `quarters` quarter turns counter-clockwise the map is np.rot90(map, "
-        "quarters), "
-        "and what was feasible along heading k is feasible along k + 2 * quarters.",
+        "quarters), and what was feasible along heading k is feasible along k + 2 * quarters.",
         draw=_tensor,
         truth=lambda tensor, quarters: _turned(tensor, quarters, 2 * quarters),
         mistakes=(
             Mistake(
-                "headings left behind",
-                "the cells turn, but each still names the old headings.",
+                "headings left behind: the cells turn, but each still names the old headings.",
                 lambda f, q: _turned(f, q, 0),
             ),
             Mistake(
-                "a heading off by one",
-                "a quarter turn is two headings of 45 degrees, not one.",
+                "a heading off by one: a quarter turn is two headings of 45 degrees, not one.",
                 lambda f, q: _turned(f, q, q),
             ),
             Mistake(
-                "headings turned the other way",
-                "counter-clockwise, headings count up: 0 (+x) becomes 2 (+y).",
+                "headings turned the other way: counter-clockwise, headings count up: 0 (+x) "
+                "becomes 2 (+y).",
                 lambda f, q: _turned(f, q, -2 * q),
             ),
             Mistake(
-                "a map turned clockwise",
-                "np.rot90 turns the first axis (x) towards the second (y): counter-clockwise "
-                "already.",
+                "a map turned clockwise: np.rot90 turns the first axis (x) towards the second (y): "
+                "counter-clockwise already.",
                 lambda f, q: _turned(f, -q, 2 * q),
             ),
             Mistake(
-                "headings turned alone",
-                "the cells must turn as well.",
+                "headings turned alone: the cells must turn as well.",
                 lambda f, q: _turned(f, 0, 2 * q),
             ),
         ),
@@ -200,28 +184,25 @@ QUESTIONS = (
         truth=lambda codes, squares, products, gram: _loss(codes, squares, products, gram),
         mistakes=(
             Mistake(
-                "a forgotten 2",
-                "both mixed terms of the square are there.",
+                "a forgotten 2: both mixed terms of the square are there.",
                 lambda g, s, p, m: _loss(g, s, p, m, cross=-1.0),
             ),
             Mistake(
-                "a turned sign",
-                "the mixed term is subtracted: (a - b)^2 = a^2 - 2 a b + b^2.",
+                "a turned sign: the mixed term is subtracted: (a - b)^2 = a^2 - 2 a b + b^2.",
                 lambda g, s, p, m: _loss(g, s, p, m, cross=2.0),
             ),
             Mistake(
-                "a forgotten Gram matrix",
-                "||D g||^2 is g . (D^T D) g, not ||g||^2.",
+                "a forgotten Gram matrix: ||D g||^2 is g . (D^T D) g, not ||g||^2.",
                 lambda g, s, p, m: _loss(g, s, p, np.eye(len(m))),
             ),
             Mistake(
-                "only the diagonal of the Gram matrix",
-                "the columns of D are not orthogonal: all of D^T D counts.",
+                "only the diagonal of the Gram matrix: the columns of D are not orthogonal: all of "
+                "D^T D counts.",
                 lambda g, s, p, m: _loss(g, s, p, np.diag(np.diag(m))),
             ),
             Mistake(
-                "one number for the whole batch",
-                "each patch has a loss of its own: sum over the latent only.",
+                "one number for the whole batch: each patch has a loss of its own: sum over the "
+                "latent only.",
                 lambda g, s, p, m: _loss(g, s, p, m).sum(),
             ),
         ),

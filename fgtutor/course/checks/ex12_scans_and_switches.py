@@ -7,12 +7,12 @@ import numpy as np
 from fgtutor.course.checks.question import Mistake, Question
 
 
-def _cloud(dice: np.random.Generator) -> tuple:
-    nx, ny, resolution = 5, 4, float(dice.choice([0.05, 0.1]))
+def _cloud(rng: np.random.Generator) -> tuple:
+    nx, ny, resolution = 5, 4, float(rng.choice([0.05, 0.1]))
     n = 30
-    cells = np.stack((dice.integers(nx, size=n), dice.integers(ny - 1, size=n)), axis=-1)
-    inside = (cells + dice.uniform(0.05, 0.95, (n, 2))) * resolution
-    return np.column_stack((inside, dice.uniform(-0.3, -0.05, n))), (nx, ny), resolution
+    cells = np.stack((rng.integers(nx, size=n), rng.integers(ny - 1, size=n)), axis=-1)
+    inside = (cells + rng.uniform(0.05, 0.95, (n, 2))) * resolution
+    return np.column_stack((inside, rng.uniform(-0.3, -0.05, n))), (nx, ny), resolution
 
 
 def _raster(
@@ -30,17 +30,13 @@ def _raster(
     return heights
 
 
-def _noise(dice: np.random.Generator) -> tuple:
-    return (
-        np.linspace(0, 20, 6),
-        float(dice.uniform(0.01, 0.05)),
-        float(dice.uniform(0.01, 0.05)),
-    )
+def _noise(rng: np.random.Generator) -> tuple:
+    return (np.linspace(0, 20, 6), float(rng.uniform(0.01, 0.05)), float(rng.uniform(0.01, 0.05)))
 
 
-def _choices(dice: np.random.Generator) -> tuple:
-    feasibility = dice.uniform(0.3, 1, (6, 2))
-    return feasibility, float(dice.uniform(0.5, 1.5))
+def _choices(rng: np.random.Generator) -> tuple:
+    feasibility = rng.uniform(0.3, 1, (6, 2))
+    return feasibility, float(rng.uniform(0.5, 1.5))
 
 
 def _sequences(feasibility: np.ndarray) -> list[tuple[float, int]]:
@@ -73,39 +69,34 @@ QUESTIONS = (
         points=2,
         title="from a point cloud to a map",
         expects="heights[ix, iy] is the HIGHEST point over the cell (the map's corner is (0, 0)), "
-        "and "
-        "NaN where the scanner hit nothing.",
+        "and NaN where the scanner hit nothing.",
         draw=_cloud,
         truth=lambda points, shape, resolution: _raster(points, shape, resolution),
         mistakes=(
             Mistake(
-                "mean for max",
-                "at the edge of a step, the mean is a height that is nowhere.",
+                "mean for max: at the edge of a step, the mean is a height that is nowhere.",
                 lambda p, s, r: _raster(p, s, r, pick=np.mean),
             ),
             Mistake(
-                "the last point for the highest",
-                "heights[ix, iy] = z keeps whichever point came last: use np.maximum.at.",
+                "the last point for the highest: heights[ix, iy] = z keeps whichever point came "
+                "last: use np.maximum.at.",
                 lambda p, s, r: _raster(p, s, r, pick=lambda z: z[-1]),
             ),
             Mistake(
-                "zeros for the unseen",
-                "an unknown cell is NaN: 0 would be free ground.",
+                "zeros for the unseen: an unknown cell is NaN: 0 would be free ground.",
                 lambda p, s, r: _raster(p, s, r, empty=0.0),
             ),
             Mistake(
-                "a floor at zero",
-                "all points here lie below 0: start from -infinity, not from zeros.",
+                "a floor at zero: all points here lie below 0: start from -infinity, not from "
+                "zeros.",
                 lambda p, s, r: np.where(np.isnan(_raster(p, s, r)), np.nan, 0.0),
             ),
             Mistake(
-                "swapped axes",
-                "the first index is ix: maps here are not images.",
+                "swapped axes: the first index is ix: maps here are not images.",
                 lambda p, s, r: _raster(p[:, [1, 0, 2]], s[::-1], r),
             ),
             Mistake(
-                "the lowest point",
-                "a foot is stopped by the highest.",
+                "the lowest point: a foot is stopped by the highest.",
                 lambda p, s, r: _raster(p, s, r, pick=np.min),
             ),
         ),
@@ -121,34 +112,31 @@ QUESTIONS = (
         points=2,
         title="how lost is the robot after t seconds?",
         expects="sqrt(fix^2 + drift^2 t): a random walk's VARIANCE grows with time, and "
-        "independent "
-        "errors add their variances.",
+        "independent errors add their variances.",
         draw=_noise,
         truth=lambda t, fix, drift: np.hypot(fix, drift * np.sqrt(t)),
         mistakes=(
             Mistake(
-                "standard deviations that add up",
-                "independent errors partly cancel: their squares add up.",
+                "standard deviations that add up: independent errors partly cancel: their squares "
+                "add up.",
                 lambda t, fix, drift: fix + drift * np.sqrt(t),
             ),
             Mistake(
-                "a drift that only ever grows one way",
-                "drift * t is a bias; a random walk gets as far as drift * sqrt(t).",
+                "a drift that only ever grows one way: drift * t is a bias; a random walk gets as "
+                "far as drift * sqrt(t).",
                 lambda t, fix, drift: np.hypot(fix, drift * t),
             ),
             Mistake(
-                "a variance for a standard deviation",
-                "the root is missing: the answer is in metres.",
+                "a variance for a standard deviation: the root is missing: the answer is in "
+                "metres.",
                 lambda t, fix, drift: fix**2 + drift**2 * t,
             ),
             Mistake(
-                "a forgotten fix",
-                "at t = 0 the error is that of one fix.",
+                "a forgotten fix: at t = 0 the error is that of one fix.",
                 lambda t, fix, drift: drift * np.sqrt(t),
             ),
             Mistake(
-                "a fix that gets better with time",
-                "the fixes are not averaged: each step uses one.",
+                "a fix that gets better with time: the fixes are not averaged: each step uses one.",
                 lambda t, fix, drift: np.hypot(fix / np.sqrt(t + 1), drift * np.sqrt(t)),
             ),
         ),
@@ -163,35 +151,27 @@ QUESTIONS = (
         points=3,
         title="plan with a price on switching",
         expects="the smallest sum over the steps of 1 / F[step, policy of that step], plus "
-        "switch_cost "
-        "for every change of policy; the first policy is free.",
+        "switch_cost for every change of policy; the first policy is free.",
         draw=_choices,
         examples=((np.array([[0.9, 0.5], [0.5, 0.6], [0.9, 0.5]]), 1.0),),
         truth=lambda feasibility, switch_cost: _cheapest(feasibility, switch_cost),
         mistakes=(
             Mistake(
-                "the greedy choice",
-                "the best policy at every step may switch to and fro; staying can be cheaper.",
+                "the greedy choice: the best policy at every step may switch to and fro; staying "
+                "can be cheaper.",
                 _greedy,
             ),
+            Mistake("free switching: the changes are not paid.", lambda f, s: _cheapest(f, 0.0)),
             Mistake(
-                "free switching",
-                "the changes are not paid.",
-                lambda f, s: _cheapest(f, 0.0),
-            ),
-            Mistake(
-                "one policy for all",
-                "a switch is dear, but not forbidden.",
+                "one policy for all: a switch is dear, but not forbidden.",
                 lambda f, s: (1 / f).sum(axis=0).min(),
             ),
             Mistake(
-                "a price for the first policy",
-                "the robot starts with whichever policy it likes.",
+                "a price for the first policy: the robot starts with whichever policy it likes.",
                 lambda f, s: _cheapest(f, s, first=1),
             ),
             Mistake(
-                "a price for every step",
-                "only a CHANGE of policy costs.",
+                "a price for every step: only a CHANGE of policy costs.",
                 lambda f, s: (1 / f.max(axis=1)).sum() + s * len(f),
             ),
         ),
@@ -212,29 +192,23 @@ QUESTIONS = (
         truth=lambda: 0.95 * 0.85,
         mistakes=(
             Mistake(
-                "the mean of the rates",
-                "that is the chance of ONE switch drawn at random; here all five must succeed.",
+                "the mean of the rates: that is the chance of ONE switch drawn at random; here all "
+                "five must succeed.",
                 lambda: (0.95 + 1 + 1 + 0.85 + 1) / 5,
             ),
+            Mistake("the weakest switch alone: the others can fail too.", lambda: 0.85),
             Mistake(
-                "the weakest switch alone",
-                "the others can fail too.",
-                lambda: 0.85,
-            ),
-            Mistake(
-                "failures that are added",
-                "1 - 0.05 - 0.15 counts the runs twice in which both fail.",
+                "failures that are added: 1 - 0.05 - 0.15 counts the runs twice in which both "
+                "fail.",
                 lambda: 0.80,
             ),
             Mistake(
-                "percent for a probability",
-                "a probability lies between 0 and 1.",
+                "percent for a probability: a probability lies between 0 and 1.",
                 lambda: 100 * 0.95 * 0.85,
             ),
             Mistake(
-                "the measured success",
-                "70 % is what the whole walk achieved; it includes the walking between the "
-                "switches.",
+                "the measured success: 70 % is what the whole walk achieved; it includes the "
+                "walking between the switches.",
                 lambda: 0.70,
             ),
         ),

@@ -1,7 +1,7 @@
-"""Asking a learner's function: call it on every case, within a time limit, and say what happened.
+"""A reply: what a learner's function answers to every case, or why there are no answers.
 
-Reads a function (or, for a judgement, a value) and cases; gives a plain reply: the answers, or why
-there are none. The same code runs in the learner's own kernel and in the grader's worker.
+Reads a function (or, for a judgement, a value) and cases; calls it within a time limit and gives
+plain values. The same code runs in the learner's own kernel and in the grader's worker.
 """
 
 import copy
@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from fgtutor.course.grading.values import encode
+from fgtutor.course.grading.answers import encode
 from fgtutor.errors import ConfigError
 
 NOT_STARTED, CRASHED, TOO_SLOW = "not started", "crashed", "too slow"
@@ -59,7 +59,7 @@ def time_limit(seconds: float, patience: float = PATIENCE) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def ask(
+def reply_of(
     target: Any, cases: Sequence[tuple] | None, seconds: float, patience: float = PATIENCE
 ) -> dict[str, Any]:
     """Return {"answers": [...]}, encoded, or {"outcome": ..., "detail": ...}.

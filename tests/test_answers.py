@@ -8,7 +8,7 @@ import pytest
 
 from fgtutor.course.checks import find
 from fgtutor.course.checks.question import CRASHED, WRONG, Judge
-from fgtutor.course.grading.values import decode, difference, encode
+from fgtutor.course.grading.answers import decode, difference, encode
 from fgtutor.errors import ConfigError
 
 Q1, Q3 = "ex10.q1", "ex10.q3"

@@ -9,9 +9,9 @@ Z = 1.959963984540054
 REACHED, NO_ROUTE = 0, 1
 
 
-def _counts(dice: np.random.Generator) -> tuple:
-    trials = dice.integers(5, 200, 6)
-    successes = (trials * dice.uniform(0, 1, 6)).astype(int)
+def _counts(rng: np.random.Generator) -> tuple:
+    trials = rng.integers(5, 200, 6)
+    successes = (trials * rng.uniform(0, 1, 6)).astype(int)
     successes[0] = trials[0]  # a perfect score, where the textbook interval fails
     return successes, trials
 
@@ -36,11 +36,11 @@ def _uncentred(successes: np.ndarray, trials: np.ndarray) -> tuple:
     return share - half, share + half
 
 
-def _outcomes(dice: np.random.Generator) -> tuple:
+def _outcomes(rng: np.random.Generator) -> tuple:
     n, policies, terrains = 60, 3, 4
-    terrain, policy = dice.integers(terrains, size=n), dice.integers(policies, size=n)
+    terrain, policy = rng.integers(terrains, size=n), rng.integers(policies, size=n)
     policy[(terrain == 1) & (policy == 2)] = 0  # one pair is never tried
-    return terrain, policy, dice.choice(4, n, p=[0.5, 0.25, 0.15, 0.1]), terrains, policies
+    return terrain, policy, rng.choice(4, n, p=[0.5, 0.25, 0.15, 0.1]), terrains, policies
 
 
 def _rates(
@@ -59,9 +59,9 @@ def _of_planned(
     return _rates(terrain[kept], policy[kept], outcome[kept], terrains, policies)
 
 
-def _route(dice: np.random.Generator) -> tuple:
-    n = int(dice.integers(10, 25))
-    return dice.integers(8, size=n), dice.integers(3, size=n), 4, 0.1
+def _route(rng: np.random.Generator) -> tuple:
+    n = int(rng.integers(10, 25))
+    return rng.integers(8, size=n), rng.integers(3, size=n), 4, 0.1
 
 
 def _metres(
@@ -77,37 +77,30 @@ QUESTIONS = (
         points=3,
         title="how sure is a success rate?",
         expects="(low, high) of the Wilson interval with z = 1.96: centre (p + z^2/2n) / (1 + "
-        "z^2/n), "
-        "half width z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2 / 4n^2); within [0, 1], and of some "
-        "width even when every trial succeeded.",
+        "z^2/n), half width z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2 / 4n^2); within [0, 1], and "
+        "of some width even when every trial succeeded.",
         draw=_counts,
         truth=lambda successes, trials: _wilson(successes, trials),
         mistakes=(
             Mistake(
-                "the textbook interval",
-                "p +- z sqrt(p (1 - p) / n) has no width at p = 1, and leaves [0, 1].",
+                "the textbook interval: p +- z sqrt(p (1 - p) / n) has no width at p = 1, and "
+                "leaves [0, 1].",
                 _wald,
             ),
             Mistake(
-                "a centre at p",
-                "Wilson's interval is not symmetric about p: its centre is drawn towards 1/2.",
+                "a centre at p: Wilson's interval is not symmetric about p: its centre is drawn "
+                "towards 1/2.",
                 _uncentred,
             ),
             Mistake(
-                "z = 1 for z = 1.96",
-                "one standard error covers 68 %, not 95 %.",
+                "z = 1 for z = 1.96: one standard error covers 68 %, not 95 %.",
                 lambda s, n: _wilson(s, n, 1.0),
             ),
             Mistake(
-                "a one-sided z",
-                "1.645 leaves 5 % on EACH side; 95 % in the middle needs 1.96.",
+                "a one-sided z: 1.645 leaves 5 % on EACH side; 95 % in the middle needs 1.96.",
                 lambda s, n: _wilson(s, n, 1.6448536),
             ),
-            Mistake(
-                "swapped ends",
-                "the low end comes first.",
-                lambda s, n: _wilson(s, n)[::-1],
-            ),
+            Mistake("swapped ends: the low end comes first.", lambda s, n: _wilson(s, n)[::-1]),
         ),
         hints=(
             "p = successes / trials; compute centre and half width one after the other.",
@@ -129,30 +122,25 @@ QUESTIONS = (
         ),
         mistakes=(
             Mistake(
-                "refusals left out",
-                "a planner that finds no route has failed too (outcome 1), or one that only dares "
-                "the "
-                "easy trials would win.",
+                "refusals left out: a planner that finds no route has failed too (outcome 1), or "
+                "one that only dares the easy trials would win.",
                 _of_planned,
             ),
             Mistake(
-                "a transposed table",
-                "terrains are rows, policies columns.",
+                "a transposed table: terrains are rows, policies columns.",
                 lambda t, p, o, nt, np_: _rates(t, p, o, nt, np_).T,
             ),
             Mistake(
-                "zeros for nothing tried",
-                "a rate of 0 says that it always failed; where nothing was tried, NaN.",
+                "zeros for nothing tried: a rate of 0 says that it always failed; where nothing "
+                "was tried, NaN.",
                 lambda t, p, o, nt, np_: np.nan_to_num(_rates(t, p, o, nt, np_)),
             ),
             Mistake(
-                "failures for successes",
-                "outcome 0 is `reached`.",
+                "failures for successes: outcome 0 is `reached`.",
                 lambda t, p, o, nt, np_: 1 - _rates(t, p, o, nt, np_),
             ),
             Mistake(
-                "counts for rates",
-                "divide by the trials of that pair.",
+                "counts for rates: divide by the trials of that pair.",
                 lambda t, p, o, nt, np_: np.array(
                     [
                         [np.sum((t == i) & (p == j) & (o == 0)) for j in range(np_)]
@@ -171,44 +159,39 @@ QUESTIONS = (
         name="metres_by_policy",
         points=2,
         title="who walked how far?",
-        expects="the metres of the route that each of `count` policies walks: a step along an "
-        "axis is "
-        "`resolution` long, a diagonal one sqrt(2) times that; 0 for a policy without a step.",
+        expects="the metres of the route that each of `count` policies walks: a step along an axis "
+        "is `resolution` long, a diagonal one sqrt(2) times that; 0 for a policy without a step.",
         draw=_route,
         truth=lambda headings, policies, count, resolution: _metres(
             headings, policies, count, resolution
         ),
         mistakes=(
             Mistake(
-                "steps for metres",
-                "that counts steps.",
+                "steps for metres: that counts steps.",
                 lambda h, p, n, r: np.bincount(p, minlength=n),
             ),
             Mistake(
-                "diagonals as short as the others",
-                "odd headings are diagonal: sqrt(2) cells long.",
+                "diagonals as short as the others: odd headings are diagonal: sqrt(2) cells long.",
                 lambda h, p, n, r: np.bincount(p, minlength=n) * r,
             ),
             Mistake(
-                "a forgotten resolution",
-                "STEP_LENGTHS counts cells; a cell is `resolution` metres.",
+                "a forgotten resolution: STEP_LENGTHS counts cells; a cell is `resolution` metres.",
                 lambda h, p, n, r: _metres(h, p, n, 1.0),
             ),
             Mistake(
-                "diagonal and straight exchanged",
-                "heading 0 is +x: even headings lie along the axes.",
+                "diagonal and straight exchanged: heading 0 is +x: even headings lie along the "
+                "axes.",
                 lambda h, p, n, r: (
                     _metres(h + 1, p, n, r) if h.max() < 7 else _metres((h + 1) % 8, p, n, r)
                 ),
             ),
             Mistake(
-                "shares for metres",
-                "it is divided by the whole length.",
+                "shares for metres: it is divided by the whole length.",
                 lambda h, p, n, r: _metres(h, p, n, r) / _metres(h, p, n, r).sum(),
             ),
             Mistake(
-                "missing idle policies",
-                "a policy that never walks has 0 m: np.bincount needs minlength=count.",
+                "missing idle policies: a policy that never walks has 0 m: np.bincount needs "
+                "minlength=count.",
                 lambda h, p, n, r: _metres(h, p, 0, r),
             ),
         ),
@@ -223,35 +206,25 @@ QUESTIONS = (
         points=2,
         title="how many trials make a 99 %?",
         expects="the smallest number of trials, all successful, after which the lower end of the "
-        "95 % "
-        "Wilson interval lies above 0.99.",
+        "95 % Wilson interval lies above 0.99.",
         truth=lambda: 381,
         mistakes=(
             Mistake(
-                "one trial in a hundred",
-                "100 successes of 100 still allow a rate of 96 %.",
+                "one trial in a hundred: 100 successes of 100 still allow a rate of 96 %.",
                 lambda: 100,
             ),
             Mistake(
-                "the rule of three",
-                "3 / n is a one-sided 95 % bound; the interval asked for is two-sided.",
+                "the rule of three: 3 / n is a one-sided 95 % bound; the interval asked for is "
+                "two-sided.",
                 lambda: 300,
             ),
             Mistake(
-                "a forgotten square",
-                "the lower end is n / (n + z^2), with z squared.",
-                lambda: 195,
+                "a forgotten square: the lower end is n / (n + z^2), with z squared.", lambda: 195
             ),
             Mistake(
-                "one trial too few",
-                "at 380 the lower end is still just below 0.99.",
-                lambda: 380,
+                "one trial too few: at 380 the lower end is still just below 0.99.", lambda: 380
             ),
-            Mistake(
-                "a bound of 0.9",
-                "0.99 is asked for.",
-                lambda: 35,
-            ),
+            Mistake("a bound of 0.9: 0.99 is asked for.", lambda: 35),
         ),
         hints=(
             "Put p = 1 into the formula: what is left of the lower end?",
