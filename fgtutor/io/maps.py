@@ -125,12 +125,10 @@ def _load_png(path: Path) -> dict[str, Any]:
             f"it is not the picture that {sidecar.name} describes: {_CURE} (or delete the line "
             "`picture`, if you changed it on purpose)"
         )
-
-    def strip(rows: slice) -> tuple[np.ndarray, np.ndarray]:
-        some = values[rows]
-        return some, np.logical_and(*(some != one for one in (notes.unknown, clear)))
-
-    heights = heights_of(values.shape, strip, notes.scale, notes.offset)
+    known = np.logical_and(*(values != one for one in (notes.unknown, clear)))
+    heights = heights_of(
+        values.shape, lambda rows: (values[rows], known[rows]), notes.scale, notes.offset
+    )
     return {"heights": heights, "resolution": notes.resolution, "origin": notes.origin}
 
 

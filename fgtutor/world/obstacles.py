@@ -141,36 +141,23 @@ class Course:
         """Add a block over the full width."""
         self.block(x0, x1, 0.0, self.width, top)
 
-    def ramp_x(self, x0: float, x1: float, y0: float, y1: float, z0: float, z1: float) -> None:
-        """Add a surface that goes from height z0 at x0 to z1 at x1."""
-        self.block(x0, x1, y0, y1, min(z0, z1))
-        self._wedge((x0, x1, z0, z1), (y0 + y1) / 2, y1 - y0, along_x=True)
-
-    def ramp_y(self, x0: float, x1: float, y0: float, y1: float, z0: float, z1: float) -> None:
-        """Add a surface that goes from height z0 at y0 to z1 at y1."""
-        self.block(x0, x1, y0, y1, min(z0, z1))
-        self._wedge((y0, y1, z0, z1), (x0 + x1) / 2, x1 - x0, along_x=False)
-
-    def _wedge(
-        self,
-        profile: tuple[float, float, float, float],
-        across: float,
-        breadth: float,
-        along_x: bool,
+    def ramp(
+        self, x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, *, along: str
     ) -> None:
-        """Add a tilted box whose upper face is the slope; its bottom lies in the ground."""
-        s0, s1, z0, z1 = profile
+        """Add a slope: a surface from height z0 to z1 along "x" or "y"."""
+        self.block(x0, x1, y0, y1, min(z0, z1))
+        s0, s1 = (x0, x1) if along == "x" else (y0, y1)
         angle = math.atan2(z1 - z0, s1 - s0)
         length = math.hypot(z1 - z0, s1 - s0)
         # Thick enough that no robot can walk under the high end, which stands on the lower level.
         thickness = abs(z1 - z0) * math.cos(angle) + 0.05
         s = (s0 + s1) / 2 + math.sin(angle) * thickness / 2
         z = (z0 + z1) / 2 - math.cos(angle) * thickness / 2
-        if along_x:  # a positive pitch lowers the front (REP-103), hence the sign
-            box = Box(centre=(s, across, z), size=(length, breadth, thickness), rpy=(0, -angle, 0))
+        if along == "x":  # a positive pitch lowers the front (REP-103), hence the sign
+            centre, size, rpy = (s, (y0 + y1) / 2, z), (length, y1 - y0, thickness), (0, -angle, 0)
         else:
-            box = Box(centre=(across, s, z), size=(breadth, length, thickness), rpy=(angle, 0, 0))
-        self.boxes.append(box)
+            centre, size, rpy = ((x0 + x1) / 2, s, z), (x1 - x0, length, thickness), (angle, 0, 0)
+        self.boxes.append(Box(centre=centre, size=size, rpy=rpy))
 
     def cuts(self, span: float, low: float, high: float) -> list[float]:
         """Return borders from 0 to `span` at random distances between `low` and `high`."""
@@ -267,8 +254,8 @@ def _valley(course: Course, x0: float, x1: float) -> float:
     width = course.width
     foot = course.snap(course.scale.valley_height / math.tan(angle))
     left, right = min(foot, width - bottom), min(foot, bottom)
-    course.ramp_y(x0, x1, bottom, bottom + left, 0.0, left * math.tan(angle))
-    course.ramp_y(x0, x1, bottom - right, bottom, right * math.tan(angle), 0.0)
+    course.ramp(x0, x1, bottom, bottom + left, 0.0, left * math.tan(angle), along="y")
+    course.ramp(x0, x1, bottom - right, bottom, right * math.tan(angle), 0.0, along="y")
     course.block(x0, x1, bottom + left, width, left * math.tan(angle))
     course.block(x0, x1, 0.0, bottom - right, right * math.tan(angle))
     return bottom
@@ -295,13 +282,13 @@ def _hill(course: Course, x0: float, x1: float, y0: float, y1: float, *, banked:
     top0 = course.snap(x0 + height / slope_up + scale.resolution / 2)
     top1 = course.snap(x1 - height / slope_down - scale.resolution / 2)
     top = float(height * rng.choice((1, -1), p=(0.7, 0.3)))
-    course.ramp_x(x0, top0, y0, y1, 0.0, top)
-    course.ramp_x(top1, x1, y0, y1, top, 0.0)
+    course.ramp(x0, top0, y0, y1, 0.0, top, along="x")
+    course.ramp(top1, x1, y0, y1, top, 0.0, along="x")
     tilt = math.tan(math.radians(steepest * rng.uniform(0.15, 0.3))) * rng.choice((-1, 1))
     rise, flat = float(tilt * (y1 - y0) / 2), course.snap(0.2)
     if banked and rng.random() < scale.bank_share and top1 - top0 > 3 * flat:
         course.block(top0, top0 + flat, y0, y1, top)
-        course.ramp_y(top0 + flat, top1 - flat, y0, y1, top - rise, top + rise)
+        course.ramp(top0 + flat, top1 - flat, y0, y1, top - rise, top + rise, along="y")
         course.block(top1 - flat, top1, y0, y1, top)
     else:
         course.block(top0, top1, y0, y1, top)

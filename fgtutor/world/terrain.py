@@ -8,7 +8,7 @@ above. Kinds: the paper's steps, gaps, bridge and valley (Sec. IV-A), and slopes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from annotated_types import Interval
@@ -101,13 +101,7 @@ class Terrain:
 
     @classmethod
     def from_elevation(
-        cls,
-        elevation: ElevationMap,
-        start: Point,
-        goal: Point,
-        *,
-        name: str = "map",
-        robot: str = "toy",
+        cls, elevation: ElevationMap, start: Point, goal: Point, *, robot: str = "toy"
     ) -> Self:
         """Return a terrain for a map that came from elsewhere; it has no boxes.
 
@@ -116,7 +110,17 @@ class Terrain:
         """
         for point in (start, goal):
             elevation.cell_of(*point)
-        return cls(name, robot, 1.0, 0, elevation, (), start, goal, (), (start, goal))
+        return cls(
+            name="map",
+            robot=robot,
+            difficulty=1.0,
+            seed=0,
+            elevation=elevation,
+            boxes=(),
+            start=start,
+            goal=goal,
+            lane=(start, goal),
+        )
 
 
 TERRAINS = (*OBSTACLES, "mixed")
@@ -202,32 +206,26 @@ def make_terrain(
 def finish_course(
     course: Course,
     *,
-    name: str,
-    robot: str,
-    seed: int,
     length: float,
     start: Point,
     goal: Point,
     sections: Sequence[Section],
     lane: Sequence[Point] = (),
-    limits: tuple[float, float] | None = None,
+    **fields: Any,
 ) -> Terrain:
     """Return the terrain that a course of `length` (m) makes, with the map of its boxes.
 
-    The lane leads from the start over the points given to the goal.
+    The lane leads from the start over the points given to the goal; `fields` are the terrain's own.
     """
     return Terrain(
-        name=name,
-        robot=robot,
         difficulty=course.difficulty,
-        seed=seed,
         elevation=rasterise(course.boxes, (length, course.width), course.scale.resolution),
         boxes=tuple(course.boxes),
         start=start,
         goal=goal,
         sections=tuple(sections),
         lane=(start, *lane, goal),
-        limits=limits,
+        **fields,
     )
 
 
