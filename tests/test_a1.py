@@ -12,7 +12,8 @@ from fgtutor.patches import prepare, sample_patches
 from fgtutor.policies.symmetry import SymmetricMLPModel
 from fgtutor.robots import ROBOTS
 from fgtutor.robots.a1 import rewards
-from fgtutor.robots.a1.env import A1_EPISODES, A1_GRID, A1Env, A1EnvConfig, _edges
+from fgtutor.robots.a1.env import A1_EPISODES, A1_GRID, A1Env, A1EnvConfig
+from fgtutor.robots.a1.ground import edges
 from fgtutor.robots.a1.model import JOINT_RANGES, STANCE
 from fgtutor.world.terrain import Terrain, World, make_terrain
 
@@ -55,13 +56,13 @@ def same(first, second):
 
 def test_a_slope_has_no_edge_and_a_ledge_has_one():
     slope = np.tile(np.arange(6) * 0.05, (5, 1))
-    np.testing.assert_allclose(_edges(slope)[:, 1:], slope[:, 1:])
+    np.testing.assert_allclose(edges(slope)[:, 1:], slope[:, 1:])
     ledge = np.zeros((6, 5))
     ledge[3:] = 0.1
-    np.testing.assert_allclose(_edges(ledge)[:, 2], [0.0, 0.0, 0.1, 0.1, 0.1, 0.1])
-    np.testing.assert_allclose(_edges(ledge[::-1])[:, 2], [0.1, 0.1, 0.1, 0.1, 0.0, 0.0])
+    np.testing.assert_allclose(edges(ledge)[:, 2], [0.0, 0.0, 0.1, 0.1, 0.1, 0.1])
+    np.testing.assert_allclose(edges(ledge[::-1])[:, 2], [0.1, 0.1, 0.1, 0.1, 0.0, 0.0])
     groove = np.abs(np.arange(7) - 3.0)
-    np.testing.assert_allclose(_edges(groove[None])[0], [3, 2, 1, 1, 1, 2, 3])
+    np.testing.assert_allclose(edges(groove[None])[0], [3, 2, 1, 1, 1, 2, 3])
 
 
 def test_in_training_a_robot_that_turns_away_or_leaves_its_line_has_failed():

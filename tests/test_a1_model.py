@@ -6,6 +6,7 @@ import pytest
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
+from fgtutor.robots.a1 import ground
 from fgtutor.robots.a1 import model as a1_model
 from fgtutor.robots.a1.looks import dress
 from fgtutor.world.terrain import Box, make_terrain
@@ -192,9 +193,9 @@ def drop(points, elevation, **terrain):
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.002
     for box in terrain.get("boxes", ()):
-        a1_model.add_box(spec, box)
+        ground.add_box(spec, box)
     if "heightfield" in terrain:
-        a1_model.add_heightfield(spec, terrain["heightfield"])
+        ground.add_heightfield(spec, terrain["heightfield"])
     for x, y in points:
         body = spec.worldbody.add_body(pos=(x, y, float(elevation.height_at(x, y)) + 0.04))
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0, 0, 1), damping=(0.05, 0, 0))

@@ -6,7 +6,7 @@ import torch
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.robots.crossings import EnvConfig
-from fgtutor.robots.toy import LANE, ToyEnv, polyline
+from fgtutor.robots.toy import STOREY, ToyEnv, polyline
 from fgtutor.world.terrain import Terrain, World
 
 
@@ -132,6 +132,6 @@ def test_a_robot_off_its_line_has_failed_and_on_a_route_there_is_no_line(train):
     assert (env.tracking[:, 0] > 0).tolist() == [True, True, not train]
 
 
-def test_lanes_are_far_apart():
+def test_storeys_are_far_apart():
     env = on(FLAT, [(1.0, 1.0, 0.0)] * 2)
-    assert env.bodies[1][0].position.y - env.bodies[0][0].position.y == pytest.approx(LANE)
+    assert env.bodies[1][0].position.y - env.bodies[0][0].position.y == pytest.approx(STOREY)

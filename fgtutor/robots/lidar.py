@@ -28,8 +28,9 @@ from fgtutor.io.validation import (
     check_arguments,
     check_fields,
 )
+from fgtutor.robots.a1.ground import add_box
 from fgtutor.robots.a1.looks import dress
-from fgtutor.robots.a1.model import STANCE, STANCE_HEIGHT, add_box, build_spec
+from fgtutor.robots.a1.model import STANCE, STANCE_HEIGHT, build_spec
 from fgtutor.world.terrain import Terrain, boxes_from_elevation
 
 MOST_RAYS = 10_000_000

@@ -5,14 +5,14 @@ map along the heading and lets the robot drive in that cut. So going up a ledge,
 it are three different things, and one toy can drive a planned route. It rolls, lifts an axle to
 climb, hops a gap, and it can fail: roll over, get stuck at a ledge, drop into a gap.
 
-All robots live in one `pymunk.Space`, each in a lane of its own, `LANE` metres above the last.
-Yaw is kinematic: the turn rate is the command's, the wheels do not have to earn it.
+All robots live in one `pymunk.Space`, each on a storey of its own, `STOREY` metres above the last.
+Yaw is kinematic: the turn rate is the command's, whatever the wheels do.
 """
 
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import pymunk
@@ -26,17 +26,16 @@ from torch import Tensor
 from fgtutor.io.validation import Ascending, NonNegative, Positive, check_fields
 from fgtutor.patches import PatchGrid, sample_heights
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.robots.crossings import EnvConfig
 from fgtutor.world.terrain import World
 
-LANE = 1000.0
-"""Vertical distance between the lanes of two robots, m: far beyond anything they can reach."""
+STOREY = 1000.0
+"""Height of a storey, m: far beyond anything that a robot can reach."""
 SLICE = (1.5, 3.5)
 """How far a cut reaches behind and ahead of where it was made, m."""
 ROOM = 0.8
 """A cut serves until the robot comes this close to one of its ends, m."""
-PARKED = (0.0, -LANE)
-"""Where ground segments lie that no cut needs: in a lane of their own, below all robots."""
+PARKED = (0.0, -STOREY)
+"""Where ground segments lie that no cut needs: on a storey of their own, below all robots."""
 CLIFF = 0.09
 """Neighbouring cells that differ by more than this meet in a vertical edge, m."""
 RECUT = 0.05
@@ -101,17 +100,11 @@ def polyline(
     jump = np.abs(np.diff(h)) > CLIFF / 2
     bend = np.ones(len(s), dtype=bool)
     bend[1:-1] = (np.abs(np.diff(h, n=2)) > 1e-4) | jump[:-1] | jump[1:]
-    bends, edges = np.flatnonzero(bend), np.flatnonzero(jump)
-    middle = (s[edges] + s[edges + 1]) / 2
-    order = np.concatenate((3 * bends, 3 * edges + 1, 3 * edges + 2))
-    vertices = np.stack(
-        (
-            np.concatenate((s[bends], middle, middle)),
-            np.concatenate((h[bends], h[edges], h[edges + 1])),
-        ),
-        axis=-1,
-    )
-    return vertices[np.argsort(order)]
+    edges = np.flatnonzero(jump)
+    middle, twice = (s[edges] + s[edges + 1]) / 2, np.repeat(edges + 1, 2)
+    ends = np.stack((h[edges], h[edges + 1]), axis=-1).ravel()
+    vertices = (np.insert(s, twice, np.repeat(middle, 2)), np.insert(h, twice, ends))
+    return np.stack(vertices, axis=-1)[np.insert(bend, twice, True)]
 
 
 class ToyEnv(LocomotionEnv):
@@ -119,28 +112,18 @@ class ToyEnv(LocomotionEnv):
 
     num_actions = 4
     """Rear wheel, front wheel (surface speed), rear leg, front leg (length)."""
+    grid = TOY_GRID
     # Without its speeds and its height above the ground; with the command.
     felt, unfelt = (0, 1, 2, *range(6, 21)), (3, 4, 5)
 
     def __init__(
-        self,
-        world: World,
-        num_envs: int = 64,
-        *,
-        config: EnvConfig | None = None,
-        model: ToyModel | None = None,
-        seed: int = 0,
-        device: str = "cpu",
+        self, world: World, num_envs: int = 64, *, model: ToyModel | None = None, **options: Any
     ) -> None:
+        """Build the space; the further options are those of `LocomotionEnv`."""
         self.model = model or ToyModel()
-        self.grid = TOY_GRID
         self.control_dt = self.model.dt * self.model.substeps
-        super().__init__(world, num_envs, config=config, seed=seed, device=device)
+        super().__init__(world, num_envs, **options)
         self.ground = world.elevation.filled().heights.astype(np.float64)
-        self.ground_tensor = torch.as_tensor(self.ground)
-        rows, columns = self.grid.shape
-        middle = torch.arange(rows) * columns + columns // 2
-        self.middle = middle.to(device)
         self.reset_all()
 
     # Physics ----------------------------------------------------------------------------------
@@ -151,17 +134,16 @@ class ToyEnv(LocomotionEnv):
         self.space = pymunk.Space()
         self.space.gravity = (0.0, -9.81)
         self.space.iterations = 12
-        self.bodies: list[tuple[pymunk.Body, pymunk.Body, pymunk.Body]] = []
-        self.motors: list[tuple[SimpleMotor, SimpleMotor]] = []
-        self.legs: list[tuple[DampedSpring, DampedSpring]] = []
+        self.bodies: list[list[pymunk.Body]] = []
+        self.motors: list[list[SimpleMotor]] = []
+        self.legs: list[list[DampedSpring]] = []
         self.segments: list[list[pymunk.Segment]] = [[] for _ in range(n)]
         self.laid = [0] * n
         # A toy drives along a ray: (x, y) = ray_start + (s - ray_offset) * (cos, sin)(ray_yaw).
         self.ray_start, self.ray_offset, self.ray_yaw = np.zeros((n, 2)), np.zeros(n), np.zeros(n)
         self.yaw, self.yaw_rate, self.speed = np.zeros(n), np.zeros(n), np.zeros(n)
         self.leg_target = np.full((n, 2), self.model.stance)
-        self.last_action = torch.zeros(n, 4)
-        self.action_change = torch.zeros(n, 4)
+        self.last_action, self.action_change = torch.zeros(n, 4), torch.zeros(n, 4)
         self.buffer = pymunk.batch.Buffer()
         for i in range(n):
             self._build_robot(i)
@@ -170,57 +152,46 @@ class ToyEnv(LocomotionEnv):
     def _build_robot(self, i: int) -> None:
         """Add robot i: a chassis, and two wheels that slide on grooves under spring and motor."""
         m = self.model
-        length, height = m.chassis_size
         chassis = pymunk.Body(m.chassis_mass, pymunk.moment_for_box(m.chassis_mass, m.chassis_size))
-        box = pymunk.Poly.create_box(chassis, (length, height), radius=0.01)
+        box = pymunk.Poly.create_box(chassis, m.chassis_size, radius=0.01)
         box.friction = 0.4
         # Parts of one robot share a group, so that wheels never touch their own chassis.
         box.filter = pymunk.ShapeFilter(group=i + 1)
-        chassis.position = (0.0, i * LANE)
+        chassis.position = (0.0, i * STOREY)
         self.space.add(chassis, box)
-        wheels, motors, legs = [], [], []
+        bodies, motors, legs = [chassis], [], []
         for side in (-1, 1):
-            wheel = pymunk.Body(
-                m.wheel_mass, pymunk.moment_for_circle(m.wheel_mass, 0.0, m.wheel_radius)
-            )
-            wheel.position = (side * m.half_base, i * LANE - m.stance)
+            moment = pymunk.moment_for_circle(m.wheel_mass, 0.0, m.wheel_radius)
+            wheel = pymunk.Body(m.wheel_mass, moment)
+            wheel.position = (side * m.half_base, i * STOREY - m.stance)
             circle = pymunk.Circle(wheel, m.wheel_radius)
             circle.friction = m.friction
             circle.filter = pymunk.ShapeFilter(group=i + 1)
             hip = (side * m.half_base, 0.0)
-            groove = GrooveJoint(
-                chassis,
-                wheel,
-                (hip[0], -m.leg_range[0]),
-                (hip[0], -m.leg_range[1]),
-                (0.0, 0.0),
-            )
-            leg = DampedSpring(
-                chassis, wheel, hip, (0.0, 0.0), m.stance, m.leg_stiffness, m.leg_damping
-            )
+            near, far = ((hip[0], -length) for length in m.leg_range)
+            groove = GrooveJoint(chassis, wheel, near, far, (0.0, 0.0))
+            spring = (m.stance, m.leg_stiffness, m.leg_damping)
+            leg = DampedSpring(chassis, wheel, hip, (0.0, 0.0), *spring)
             motor = SimpleMotor(chassis, wheel, 0.0)
             motor.max_force = m.wheel_torque
             self.space.add(wheel, circle, groove, leg, motor)
-            wheels.append(wheel)
+            bodies.append(wheel)
             motors.append(motor)
             legs.append(leg)
-        self.bodies.append((chassis, wheels[0], wheels[1]))
-        self.motors.append((motors[0], motors[1]))
-        self.legs.append((legs[0], legs[1]))
+        self.bodies.append(bodies)
+        self.motors.append(motors)
+        self.legs.append(legs)
 
     def _read(self) -> None:
         """Copy every body's state out of the space: state [envs, 3 bodies, 6]."""
         fields = pymunk.batch.BodyFields
+        wanted = fields.POSITION | fields.ANGLE | fields.VELOCITY | fields.ANGULAR_VELOCITY
         self.buffer.clear()
-        pymunk.batch.get_space_bodies(
-            self.space,
-            fields.POSITION | fields.ANGLE | fields.VELOCITY | fields.ANGULAR_VELOCITY,
-            self.buffer,
-        )
+        pymunk.batch.get_space_bodies(self.space, wanted, self.buffer)
         flat = np.frombuffer(bytes(self.buffer.float_buf()), dtype=np.float64)
         # The static body comes last, once it has shapes.
         self.state = flat[: self.num_envs * 18].reshape(self.num_envs, 3, 6).copy()
-        self.state[:, :, 1] -= np.arange(self.num_envs)[:, None] * LANE
+        self.state[:, :, 1] -= np.arange(self.num_envs)[:, None] * STOREY
 
     def advance(self, actions: Tensor) -> None:
         """Set wheel rates and leg lengths, turn by the commanded rate, and simulate."""
@@ -267,7 +238,7 @@ class ToyEnv(LocomotionEnv):
             cos, sin = math.cos(pitch), math.sin(pitch)
             for body, side in zip(self.bodies[i], (0, -1, 1), strict=True):
                 a, b = side * m.half_base, -m.stance * abs(side)
-                body.position = (cos * a - sin * b, i * LANE + z + sin * a + cos * b)
+                body.position = (cos * a - sin * b, i * STOREY + z + sin * a + cos * b)
                 body.angle = pitch
                 body.velocity, body.angular_velocity = (0.0, 0.0), 0.0
                 self.space.reindex_shapes_for_body(body)
@@ -291,7 +262,7 @@ class ToyEnv(LocomotionEnv):
         s = np.arange(-SLICE[0], SLICE[1] + 1e-9, self.resolution / 2)
         h = self._profile(place, self.yaw[ids], s)
         for i, heights in zip(ids.tolist(), h, strict=True):
-            vertices = polyline(s, heights) + np.array((self.ray_offset[i], i * LANE))
+            vertices = polyline(s, heights) + np.array((self.ray_offset[i], i * STOREY))
             self._lay(i, vertices.tolist())
         return s, h
 
@@ -312,10 +283,8 @@ class ToyEnv(LocomotionEnv):
         flat, base = self.ground.reshape(-1), i * ny + j
         h00, h01, h10, h11 = flat[base], flat[base + 1], flat[base + ny], flat[base + ny + 1]
         smooth = (h00 * (1 - b) + h01 * b) * (1 - a) + (h10 * (1 - b) + h11 * b) * a
-        nearest = np.where(a < 0.5, np.where(b < 0.5, h00, h01), np.where(b < 0.5, h10, h11))
-        highest = np.maximum(np.maximum(h00, h01), np.maximum(h10, h11))
-        lowest = np.minimum(np.minimum(h00, h01), np.minimum(h10, h11))
-        return np.where(highest - lowest > CLIFF, nearest, smooth)
+        nearest = flat[base + ny * (a >= 0.5) + (b >= 0.5)]
+        return np.where(np.ptp((h00, h01, h10, h11), axis=0) > CLIFF, nearest, smooth)
 
     def _lay(self, i: int, vertices: list[list[float]]) -> None:
         """Move robot i's ground segments onto a polyline.
@@ -349,9 +318,7 @@ class ToyEnv(LocomotionEnv):
     def motion(self) -> tuple[Float[Tensor, "envs 4"], Float[Tensor, "envs 3"]]:
         """Return poses (x, y, z, yaw) and velocities (vx, vy, wz); a toy never slides sideways."""
         pose = np.concatenate((self._position(), self.state[:, 0, 1:2], self.yaw[:, None]), axis=1)
-        velocity = np.zeros((self.num_envs, 3))
-        velocity[:, 0] = self.speed
-        velocity[:, 2] = self.yaw_rate
+        velocity = np.stack((self.speed, np.zeros(self.num_envs), self.yaw_rate), axis=1)
         return self._tensor(pose), self._tensor(velocity)
 
     def proprioception(self) -> Float[Tensor, "envs 18"]:
@@ -376,7 +343,8 @@ class ToyEnv(LocomotionEnv):
 
     def scan(self, patch: Float[Tensor, "envs points"]) -> Float[Tensor, "envs rows"]:
         """Return the patch's middle line: what lies in the slice the toy drives in."""
-        return 4.0 * patch[:, self.middle]
+        rows, columns = self.grid.shape
+        return 4.0 * patch.reshape(-1, rows, columns)[..., columns // 2]
 
     def fallen(self) -> Bool[Tensor, "envs"]:
         """Tell which toys have rolled over or dropped an axle into a hole."""
@@ -401,9 +369,8 @@ class ToyEnv(LocomotionEnv):
         """Return r_v (Eq. 1), a wider term to climb by, and small costs of rough driving."""
         error = self._tensor(self.speed) - self.command[:, 0]
         wide = torch.exp(-error.square() / 0.5)
-        rough = 0.02 * self.action_change.square().sum(-1) + 0.002 * self._tensor(
-            self.state[:, 0, 5] ** 2
-        )
+        rocking = self._tensor(self.state[:, 0, 5] ** 2)
+        rough = 0.02 * self.action_change.square().sum(-1) + 0.002 * rocking
         return r_v + 0.5 * wide - rough - 5.0 * failed
 
     def _legs(self) -> tuple[np.ndarray, np.ndarray]:
@@ -415,10 +382,8 @@ class ToyEnv(LocomotionEnv):
         return length, rate
 
     def _ground_under(self) -> Float[np.ndarray, "envs"]:
-        s = torch.as_tensor(self.state[:, 0, 0] - self.ray_offset)[:, None] + torch.tensor(
-            (-0.25, 0.0, 0.25)
-        )
-        return self._heights_at(s).median(dim=-1).values.numpy()
+        s = torch.as_tensor(self.state[:, 0, 0] - self.ray_offset)[:, None]
+        return self._heights_at(s + torch.tensor((-0.25, 0.0, 0.25))).median(dim=-1).values.numpy()
 
     def _heights_at(self, s: Float[Tensor, "envs *points"]) -> Tensor:
         """Return ground heights at driving coordinates relative to each robot's ray start."""
@@ -427,10 +392,7 @@ class ToyEnv(LocomotionEnv):
         start = torch.as_tensor(self.ray_start).reshape(*shape, 2)
         xy = start + s[..., None] * torch.stack((torch.cos(yaw), torch.sin(yaw)), dim=-1)
         return sample_heights(
-            torch.as_tensor(self.ground).double(),
-            xy,
-            resolution=self.resolution,
-            origin=self.origin,
+            torch.as_tensor(self.ground), xy, resolution=self.resolution, origin=self.origin
         )
 
     def _tensor(self, values: np.ndarray) -> Tensor:

@@ -9,7 +9,6 @@ policy that trains on two CPU cores, adds a gait clock and left-right symmetry.
 # MuJoCo's compiled modules carry no type information that pyright could read.
 # pyright: reportAttributeAccessIssue=false
 
-import itertools
 import math
 import warnings
 from dataclasses import fields
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from fgtutor.patches import PatchGrid, ground_height, rotate, sample_heights
 from fgtutor.robots.a1 import observation, rewards
+from fgtutor.robots.a1.ground import edges
 from fgtutor.robots.a1.model import (
     FOOT_RADIUS,
     STANCE,
@@ -55,7 +55,7 @@ RIM = 0.25
 FREE_FALL = 2.0
 """A trunk that sinks faster than this falls, m/s: a step of 0.2 m would do it, walking never."""
 NOSE = 0.35
-"""How far before its middle a robot that turns at the wrong rate misses its velocity, m."""
+"""Distance ahead of the trunk's centre at which a wrong turn rate counts as a wrong velocity, m."""
 A1_EPISODES = EnvConfig(
     speed=(0.45, 0.9),
     max_turn_rate=1.0,
@@ -77,7 +77,8 @@ class A1Env(LocomotionEnv):
     """A batch of A1s in MuJoCo."""
 
     num_actions = 12
-    """Joint targets relative to the stance, in the order of `a1_model.JOINTS`."""
+    """Joint targets relative to the stance, in the order of `model.JOINTS`."""
+    grid = A1_GRID
     mirror = observation.mirror()
     episodes = A1_EPISODES
     felt, unfelt = observation.FELT, observation.UNFELT
@@ -102,7 +103,6 @@ class A1Env(LocomotionEnv):
         config = config or self.episodes
         self.settings = settings or A1EnvConfig(randomise=config.train, noise=config.train)
         self.model = model or A1Config()
-        self.grid = A1_GRID
         self.control_dt = self.model.timestep * self.settings.substeps
         super().__init__(world, num_envs, config=config, seed=seed, device=device)
         compiled = world_spec(world, self.model).compile()
@@ -110,13 +110,11 @@ class A1Env(LocomotionEnv):
         self.sensors = sensor_slices()
         ground = np.asarray(world.elevation.filled().heights)
         around = 2 * round(RIM / self.resolution) + 1
-        self.peaks = torch.as_tensor(maximum_filter(ground, 3), device=device).flatten()
-        self.edges = torch.as_tensor(_edges(ground), device=device).flatten()
+        self.peaks = torch.as_tensor(maximum_filter(ground, 3), device=device)
+        self.edges = torch.as_tensor(edges(ground), device=device)
         # Closing, unlike a maximum, does not take the foot of a wall for the floor of a hole.
-        rims = grey_closing(np.pad(ground, around, mode="edge"), around)
-        rims = np.ascontiguousarray(rims[around:-around, around:-around])
-        self.rims = torch.as_tensor(rims, device=device).flatten()
-        self.map_shape = ground.shape
+        closed = grey_closing(np.pad(ground, around, mode="edge"), around)
+        self.rims = torch.as_tensor(closed[around:-around, around:-around], device=device)
         self.stance = torch.tensor(STANCE, device=device)
         self.look_points = LOOK_GRID.points.to(device)
         self.noise, self.scale = (
@@ -181,7 +179,7 @@ class A1Env(LocomotionEnv):
     def _count_explosions(self, broken: Bool[Tensor, "envs"]) -> None:
         """Mark simulations whose numbers blew up, or whose actions were not numbers, as lost.
 
-        They stay lost until they are placed anew; the others are not touched.
+        They stay lost until they are placed anew; no other simulation is touched.
         """
         lost = broken
         lost[self.physics.exploded()] = True
@@ -247,12 +245,14 @@ class A1Env(LocomotionEnv):
         self.exploded[ids] = False
         self._read()
 
-    def _lookup(self, cells: Tensor, xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+    def _lookup(
+        self, cells: Float[Tensor, "nx ny"], xy: Float[Tensor, "*batch 2"]
+    ) -> Float[Tensor, "*batch"]:
         """Return the value of the cell that each point lies in; off the map, of the nearest."""
-        nx, ny = self.map_shape
+        nx, ny = cells.shape
         i = ((xy[..., 0] - self.origin[0]) / self.resolution).long().clamp(0, nx - 1)
         j = ((xy[..., 1] - self.origin[1]) / self.resolution).long().clamp(0, ny - 1)
-        return cells[i * ny + j]
+        return cells[i, j]
 
     # What the base class asks -----------------------------------------------------------------
 
@@ -335,7 +335,7 @@ class A1Env(LocomotionEnv):
         velocity = self.along_heading(self.pose, self.velocity)
         wrong = (velocity - self.command[:, :2]).norm(dim=-1)
         turn = self.velocity[:, 2] - self.command[:, 2]
-        # Felt by its nose: who is told to turn on the spot and does not has no other speed to miss.
+        # The error of a point ahead of the trunk: on the spot, turning wrongly is the only error.
         nose = torch.hypot(wrong, NOSE * turn)
         style = rewards.moving(nose)
         force = self._feet("foot_force").norm(dim=-1)
@@ -364,23 +364,8 @@ class A1Env(LocomotionEnv):
         return {f.name: getattr(weights, f.name) * terms[f.name] for f in fields(weights)}
 
     def _feet(self, name: str) -> Float[Tensor, "envs 4 3"]:
-        """Return a group of sensors, one vector a foot."""
+        """Return a group of sensors, one vector per foot."""
         return self.sensed[:, self.sensors[name]].reshape(-1, 4, 3)
-
-
-def _edges(ground: Float[np.ndarray, "nx ny"]) -> Float[np.ndarray, "nx ny"]:
-    """Return the height of each cell or of an edge beside it; a steady slope has no edge.
-
-    The rise to a neighbour counts as far as it exceeds the rise up to here from the other side.
-    """
-    nx, ny = ground.shape
-    padded = np.pad(ground, 1, mode="edge")
-    edge = np.zeros_like(ground)
-    for i, j in itertools.product((-1, 0, 1), repeat=2):
-        ahead = padded[1 + i : 1 + i + nx, 1 + j : 1 + j + ny] - ground
-        behind = ground - padded[1 - i : 1 - i + nx, 1 - j : 1 - j + ny]
-        edge = np.maximum(edge, ahead - behind.clip(min=0.0))
-    return ground + edge
 
 
 def _quaternion(

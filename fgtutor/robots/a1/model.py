@@ -1,4 +1,4 @@
-"""The Unitree A1 as a MuJoCo model: its published constants, and how terrain enters the simulation.
+"""The Unitree A1 as a MuJoCo model, on terrain: its published constants and its controllers.
 
 Reads the terrain as boxes or as an elevation map; gives an `MjSpec` for `physics.Physics`. The
 constants come from the maker's description, robots/a1_description/urdf/a1.urdf in
@@ -18,8 +18,8 @@ from annotated_types import Interval
 from jaxtyping import Float
 
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError
 from fgtutor.io.validation import check_fields
+from fgtutor.robots.a1.ground import add_box, add_ground, add_heightfield, blocky
 from fgtutor.world.boxes import Box
 from fgtutor.world.terrain import World
 
@@ -201,7 +201,7 @@ def build_spec(
     if heightfield is not None:
         add_heightfield(spec, heightfield)
     elif not boxes:
-        _add_terrain_geom(spec, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0))
+        add_ground(spec, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0))
     key = spec.add_key(name="stance")
     key.qpos = (0.0, 0.0, STANCE_HEIGHT, 1.0, 0.0, 0.0, 0.0, *STANCE)
     key.ctrl = STANCE
@@ -211,56 +211,9 @@ def build_spec(
 def world_spec(world: World, model: A1Config) -> mujoco.MjSpec:
     """Return the model of the world: boxes if its ground is made of blocks, else a height field."""
     tiles = [tile for row in world.tiles for tile in row]
-    if all(tile.boxes or _blocky(tile.elevation) for tile in tiles):
+    if all(tile.boxes or blocky(tile.elevation) for tile in tiles):
         return build_spec(world.boxes, config=model)
     return build_spec(heightfield=world.elevation.filled(), config=model)
-
-
-def _blocky(elevation: ElevationMap) -> bool:
-    """Tell whether most neighbouring cells have equal heights, so that few boxes suffice."""
-    heights = np.asarray(elevation.filled().heights)
-    return all(float((np.diff(heights, axis=k) == 0).mean()) > 0.9 for k in (0, 1))
-
-
-def add_box(spec: mujoco.MjSpec, box: Box) -> None:
-    """Add one box of terrain; `box.size` holds full lengths, MuJoCo wants half."""
-    half = tuple(length / 2 for length in box.size)
-    _add_terrain_geom(
-        spec, type=mujoco.mjtGeom.mjGEOM_BOX, pos=box.centre, quat=box.quaternion, size=half
-    )
-
-
-def add_heightfield(spec: mujoco.MjSpec, elevation: ElevationMap, *, base: float = 0.1) -> None:
-    """Add an elevation map as a height field whose vertices are the centres of the cells.
-
-    It covers the map but for half a cell along the border; `base` is its thickness below the lowest
-    cell, m. Raises `ConfigError` if the map has unknown cells.
-    """
-    heights = np.asarray(elevation.heights, dtype=float)
-    if not np.isfinite(heights).all():
-        raise ConfigError("a height field needs every height; call elevation.filled() first")
-    low = float(heights.min())
-    # MuJoCo refuses a height field without relief, so a flat map gets a token one it never reaches.
-    relief = max(float(heights.max()) - low, 1e-6)
-    nx, ny = heights.shape
-    # Rows of a MuJoCo height field run along y and columns along x: [ix, iy] is transposed.
-    half = elevation.resolution / 2
-    spec.add_hfield(
-        name="terrain",
-        nrow=ny,
-        ncol=nx,
-        size=((nx - 1) * half, (ny - 1) * half, relief, base),
-        userdata=((heights - low) / relief).T.ravel(),
-    )
-    x, y = elevation.origin[0] + nx * half, elevation.origin[1] + ny * half
-    _add_terrain_geom(
-        spec, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="terrain", pos=(x, y, low)
-    )
-
-
-def _add_terrain_geom(spec: mujoco.MjSpec, **properties: object) -> None:
-    # Terrain only receives contacts and the robot only makes them, so neither meets itself.
-    spec.worldbody.add_geom(contype=0, conaffinity=1, rgba=(0.62, 0.6, 0.57, 1.0), **properties)
 
 
 def _set_options(spec: mujoco.MjSpec, config: A1Config) -> None:
