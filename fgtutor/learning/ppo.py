@@ -69,8 +69,8 @@ class FeasibilityPPO(PPO):
 
     def fit_context(self, context: ContextNet, *samples: Tensor) -> dict[str, float]:
         """Fit the context encoder to the samples of one rollout; return the mean loss parts."""
-        draws = self._draw(samples, self.context_updates, self.context_batch)
-        losses = self._fit(context, self.context_optimizer, samples, draws)
+        shape = self.context_updates, self.context_batch
+        losses, _ = self._fit(context, self.context_optimizer, samples, shape)
         return {f"context_{name}": value for name, value in losses.items()}
 
     def fit_feasibility(self) -> dict[str, float]:
@@ -85,8 +85,8 @@ class FeasibilityPPO(PPO):
             (observations["patch"][valid], observations["command"][valid], label[valid])
         )
         samples = tuple(torch.cat(parts) for parts in zip(*self.memory, strict=True))
-        draws = self._draw(samples, self.feasibility_updates, self.feasibility_batch)
-        losses = self._fit(self.feasibility, self.feasibility_optimizer, samples, draws)
+        shape = self.feasibility_updates, self.feasibility_batch
+        losses, draws = self._fit(self.feasibility, self.feasibility_optimizer, samples, shape)
         with torch.no_grad():
             reconstruction = self.feasibility.reconstruction(samples[0][draws[:8].flatten()])
         levels = torch.tensor(QUANTILES, device=reconstruction.device)
@@ -96,25 +96,25 @@ class FeasibilityPPO(PPO):
             **{f"L_recon_{q}": value for q, value in zip(QUANTILES, quantiles, strict=True)},
         }
 
-    def _draw(self, samples: Sequence[Tensor], updates: int, batch: int) -> Tensor:
-        """Draw which samples each update learns from, [updates, batch]."""
-        return torch.randint(len(samples[0]), (updates, batch), device=samples[0].device)
-
     def _fit(
         self,
         net: FeasibilityNet | ContextNet,
         optimizer: torch.optim.Optimizer,
         samples: Sequence[Tensor],
-        draws: Tensor,
-    ) -> dict[str, float]:
-        """Fit a net to the samples drawn; return the mean of each part of its loss."""
+        shape: tuple[int, int],
+    ) -> tuple[dict[str, float], Tensor]:
+        """Fit a net to samples drawn at random, `shape` = (updates, batch).
+
+        Return the mean of each part of its loss, and which samples were drawn.
+        """
         sums: dict[str, float] = {}
+        draws = torch.randint(len(samples[0]), shape, device=samples[0].device)
         for chosen in draws:
             loss, parts = net.loss(*(values[chosen] for values in samples))
             self._descend(loss, net, optimizer)
             for name, value in parts.items():
                 sums[name] = sums.get(name, 0.0) + value.item() / len(draws)
-        return sums
+        return sums, draws
 
     def _descend(self, loss: Tensor, net: nn.Module, optimizer: torch.optim.Optimizer) -> None:
         """Take one step down the loss, along the mean gradient of all processes."""
