@@ -26,7 +26,8 @@ def usable_cores(root: Path = Path("/")) -> int:
     """
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
-    quota = min(_quotas(root), default=math.inf)
+    quotas = (quota for group in _groups(root, "cpu") for quota in _quota(group))
+    quota = min(quotas, default=math.inf)
     return max(1, cores if quota >= cores else math.ceil(quota))
 
 
@@ -60,12 +61,6 @@ def require_memory(needed: float, what: str, cure: str, *, fits: bool = True) ->
             f"{what} needs about {needed / 1e9:.3g} GB of memory, and {left / 1e9:.3g} GB are left"
             f"{'' if fits else '; it is too large for the search too'}: {cure}"
         )
-
-
-def _quotas(root: Path) -> Iterator[float]:
-    """Yield every CPU quota above this process, in cores."""
-    for group in _groups(root, "cpu"):
-        yield from _quota(group)
 
 
 def _groups(root: Path, controller: str) -> Iterator[Path]:

@@ -17,6 +17,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from fgtutor.errors import StorageError
 
 LOCK = ".lock"
@@ -105,7 +107,7 @@ def remove_leftovers(target: Path) -> None:
     start = f".fgtutor-{_key(target)}-"
     for path in target.parent.glob(f"{start}*"):
         writer = path.name.removeprefix(start).split("-")[0]
-        if writer.isdecimal() and not _is_running(int(writer)):
+        if writer.isdecimal() and int(writer) not in psutil.pids():
             with suppress(OSError):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
@@ -119,18 +121,6 @@ def beside(path: Path, suffix: str = "") -> Path:
 def _key(path: Path) -> str:
     """Return eight digits for the file's name on this computer, whose processes we can ask for."""
     return f"{zlib.crc32(os.fsencode(f'{platform.node()}/{path.name}')):08x}"
-
-
-def _is_running(process: int) -> bool:
-    if sys.platform == "win32":
-        return True  # there, asking ends it
-    try:
-        os.kill(process, 0)
-    except PermissionError:
-        return True
-    except (ProcessLookupError, OverflowError):
-        return False
-    return True
 
 
 def _copy(path: Path) -> Path | None:
@@ -186,9 +176,10 @@ def locked_folder(path: str | Path) -> Iterator[None]:
     except OSError as error:
         raise storage_error(file, error) from error
     with lock:
+        holder = ""
         try:
             _lock(lock.fileno())
-            # Whoever had it before may have removed it meanwhile, and a third one made a new one.
+            # The process before may have removed it meanwhile, and another one made a new one.
             if not os.path.samestat(os.fstat(lock.fileno()), file.stat()):
                 raise BlockingIOError(errno.EAGAIN, "")
             lock.truncate(0)
@@ -196,9 +187,11 @@ def locked_folder(path: str | Path) -> Iterator[None]:
             lock.flush()
         except OSError as error:
             if error.errno in (errno.EWOULDBLOCK, errno.EACCES, errno.EAGAIN, errno.ENOENT):
+                with suppress(OSError, ValueError):
+                    holder = f" ({int(file.read_text())})"
                 raise StorageError(
-                    f"another process{_holder(file)} works in {path}: wait for it to end, or "
-                    "choose another folder"
+                    f"another process{holder} works in {path}: wait for it to end, or choose "
+                    "another folder"
                 ) from error
             if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
                 raise storage_error(file, error) from error
@@ -207,13 +200,6 @@ def locked_folder(path: str | Path) -> Iterator[None]:
         finally:
             with suppress(OSError):
                 file.unlink()
-
-
-def _holder(lock: Path) -> str:
-    """Return who holds a lock, if the file tells."""
-    with suppress(OSError, ValueError):
-        return f" ({int(lock.read_text())})"
-    return ""
 
 
 def _lock(file: int) -> None:
