@@ -213,6 +213,29 @@ compare_routes(M, {"the paper's settings": route, "ours: a switch costs 1": calm
 # *What to see:* fewer switches, at hardly any price in length.
 
 # %% [markdown]
+# ## The paper in one file
+#
+# Notebooks 04 to 06 are Secs. III-B and III-C of the paper. Written down as it says, slowly and
+# without any of our tricks, they fit into 69 lines: `fgtutor/paper.py`. Read it from top to bottom
+# once; you know every line of it by now. Here is its last function. Does it agree with the fast
+# way? It asks for one patch after the other, so a part of the map will do: from the start into the
+# gap lane.
+
+# %%
+import inspect
+
+from fgtutor import paper
+from fgtutor.planning import plan_on_map
+
+print(inspect.getsource(paper.plan))
+
+# %%
+part, gaps = M.crop(0.5, 3.0, 4.0, 6.5), (3.5, 5.6)
+cells, policies, cost = paper.plan(part, zoo, START, gaps)
+fast = plan_on_map(part, zoo, START, gaps, settings=PAPER).route
+print(f"cost of the cheapest route: paper.py {cost:.4f}, the fast way {fast.cost:.4f}")
+
+# %% [markdown]
 # ## A ledge is a one-way street
 #
 # Now for the classical planner. A costmap turns heights into *one* number a cell, with
