@@ -114,7 +114,7 @@ def test_velocity_counts_along_the_heading_told():
         put(env, (2.0, 2.0, math.pi / 2), (4.0, 2.0, 1.0))
         env.crossings.told_yaw[:] = torch.tensor([0.0, 1.0])  # the first walks off to the left
         velocity = torch.tensor([[0.6, 0.0, 0.0]] * 2)
-        along = env.along_heading(env.pose, velocity)
+        along = env.crossings.along_heading(env.pose, velocity)
         torch.testing.assert_close(along, torch.tensor(expected), atol=1e-4, rtol=0)
 
 

@@ -2,7 +2,7 @@
 
 `LocomotionEnv` is rsl_rl's `VecEnv`. It owns what every robot shares: commands, patches at the
 robots' poses, the tracking reward, failures, time-outs, and placing robots for evaluation; where
-training episodes lead is the work of `crossings`. A robot adds its physics in a handful of members
+episodes lead is the work of `crossings`. A robot adds its physics in a handful of members
 (see the abstract methods). Source: paper, Sec. III-A (Eq. 1).
 """
 
@@ -96,8 +96,6 @@ class LocomotionEnv(VecEnv):
         self.cruise = torch.zeros(num_envs, device=device)
         self.tracking = torch.zeros(num_envs, 3, device=device)
         self.return_r_v = torch.zeros(num_envs, device=device)
-        self.stuck_from = torch.zeros(num_envs, 2, device=device)
-        self.stuck_steps = torch.zeros(num_envs, dtype=torch.long, device=device)
         self.history = None
         if self.config.history:
             if len(self.unfelt) != VELOCITY:
@@ -186,10 +184,11 @@ class LocomotionEnv(VecEnv):
         self.episode_length_buf += 1
         pose, velocity = self.motion()
         fell = self.fallen()
-        failed = fell | self._stuck(pose)
+        failed = fell | self.crossings.stuck(pose, self.control_dt)
         if self.config.train:
             failed |= self.crossings.strayed(pose)
-        r_v = tracking_reward(self.along_heading(pose, velocity), self.command[:, :2]) * ~failed
+        planar = self.crossings.along_heading(pose, velocity)
+        r_v = tracking_reward(planar, self.command[:, :2]) * ~failed
         reward = self.reward(r_v, failed)
         self.return_r_v += r_v
         outside, strange = self.crossings.outside(pose)
@@ -253,8 +252,6 @@ class LocomotionEnv(VecEnv):
             self.history.forget(ids)
         self.episode_length_buf[ids] = 0
         self.return_r_v[ids] = 0.0
-        self.stuck_steps[ids] = 0
-        self.stuck_from[ids] = poses[:, :2]
         self.crossings.start(ids, poses)
         self.command[ids] = 0.0
         self.command[ids, 0] = speed
@@ -279,20 +276,6 @@ class LocomotionEnv(VecEnv):
             self.heights, poses, self.grid, resolution=self.resolution, origin=self.origin
         )
 
-    def along_heading(
-        self, pose: Float[Tensor, "envs 4"], velocity: Float[Tensor, "envs 3"]
-    ) -> Float[Tensor, "envs 2"]:
-        """Return the planar velocity along and across the heading that each robot was told.
-
-        In its own frame, a robot that turns away from an obstacle and walks off would track its
-        command perfectly. On a route, the heading is the follower's to correct.
-        """
-        if not self.config.train:
-            return velocity[:, :2]
-        off = pose[:, 3] - self.crossings.told_yaw
-        cos, sin, (vx, vy) = torch.cos(off), torch.sin(off), velocity[:, :2].unbind(-1)
-        return torch.stack((cos * vx - sin * vy, sin * vx + cos * vy), dim=-1)
-
     def state_dict(self) -> dict[str, Tensor]:
         """Return what training must store to continue: the curriculum and the random stream."""
         return self.crossings.state_dict() | {"random": self.rng.get_state()}
@@ -304,13 +287,6 @@ class LocomotionEnv(VecEnv):
         """
         self.crossings.load_state_dict(state)
         self.rng.set_state(state["random"])
-
-    def _stuck(self, pose: Float[Tensor, "envs 4"]) -> Bool[Tensor, "envs"]:
-        """Tell which robots have made no progress for too long."""
-        moved = (pose[:, :2] - self.stuck_from).norm(dim=-1) > self.config.stuck_progress
-        self.stuck_from = torch.where(moved[:, None], pose[:, :2], self.stuck_from)
-        self.stuck_steps = torch.where(moved, 0, self.stuck_steps + 1)
-        return self.stuck_steps * self.control_dt > self.config.stuck_seconds
 
 
 def part(

@@ -188,6 +188,8 @@ class Crossings:
         self.turning = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.crossing = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.aside = torch.zeros(num_envs, device=device)
+        self.stuck_from = torch.zeros(num_envs, 2, device=device)
+        self.stuck_steps = torch.zeros(num_envs, dtype=torch.long, device=device)
 
     def corner(self, ids: Int[Tensor, "n"]) -> Float[Tensor, "n 2"]:
         """Return the world position of the corner (0, 0) of each robot's tile, m."""
@@ -245,7 +247,8 @@ class Crossings:
 
     def start(self, ids: Int[Tensor, "n"], poses: Float[Tensor, "n 3"]) -> None:
         """Let each robot go straight on from its pose."""
-        self.anchor[ids] = self.begin[ids] = poses[:, :2]
+        self.anchor[ids] = self.begin[ids] = self.stuck_from[ids] = poses[:, :2]
+        self.stuck_steps[ids] = 0
         self.target_yaw[ids] = self.told_yaw[ids] = poses[:, 2]
         self.crossing[ids] = self.turning[ids] = False
 
@@ -306,6 +309,13 @@ class Crossings:
         away = torch.cos(pose[:, 3] - self.told_yaw) < math.cos(math.pi / 4)
         return (beside.abs() > self.config.stray) | away
 
+    def stuck(self, pose: Float[Tensor, "envs 4"], dt: float) -> Bool[Tensor, "envs"]:
+        """Tell which robots have made no progress for too long; call it once every `dt`, s."""
+        moved = (pose[:, :2] - self.stuck_from).norm(dim=-1) > self.config.stuck_progress
+        self.stuck_from = torch.where(moved[:, None], pose[:, :2], self.stuck_from)
+        self.stuck_steps = torch.where(moved, 0, self.stuck_steps + 1)
+        return self.stuck_steps * dt > self.config.stuck_seconds
+
     def outside(
         self, pose: Float[Tensor, "envs 4"]
     ) -> tuple[Bool[Tensor, "envs"], Bool[Tensor, "envs"]]:
@@ -315,6 +325,20 @@ class Crossings:
         beyond = (x < first) | (x > last)
         strange = beyond & (x > 0.0) & (x < self.tile_size[0])
         return beyond | (y < 0.0) | (y > self.tile_size[1]), strange
+
+    def along_heading(
+        self, pose: Float[Tensor, "envs 4"], velocity: Float[Tensor, "envs 3"]
+    ) -> Float[Tensor, "envs 2"]:
+        """Return the planar velocity along and across the heading that each robot was told.
+
+        In its own frame, a robot that turns away from an obstacle and walks off would track its
+        command perfectly. On a route, the heading is the follower's to correct.
+        """
+        if not self.config.train:
+            return velocity[:, :2]
+        off = pose[:, 3] - self.told_yaw
+        cos, sin, (vx, vy) = torch.cos(off), torch.sin(off), velocity[:, :2].unbind(-1)
+        return torch.stack((cos * vx - sin * vy, sin * vx + cos * vy), dim=-1)
 
     # The curriculum ---------------------------------------------------------------------------
 

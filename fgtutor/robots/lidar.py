@@ -44,8 +44,8 @@ Length = Annotated[float, Interval(ge=0.01, le=1000)]
 Poses = Float[np.ndarray, "poses 6"]
 
 SPIN, SWEEP = 397.21, 7.0711
-"""Turns and up-down sweeps a second. Livox does not publish how its mirror moves; these draw some
-40 lines a frame and have no common period: no frame is like another, and gaps close with time."""
+"""Turns and up-down sweeps per second. Livox does not publish how its mirror moves; these draw some
+40 lines per frame and have no common period: no frame is like another, and gaps close with time."""
 MOUNT, MOUNT_ROLL = (0.28, 0.0, 0.1), math.pi
 """Where the A1 carries the sensor, from the trunk's centre, m and rad: ahead of the head, upside
 down, so that its 52 degrees look at the ground. Our choice; the paper does not say."""
@@ -53,10 +53,10 @@ down, so that its 52 degrees look at the ground. Our choice; the paper does not 
 
 @dataclass(frozen=True, kw_only=True)
 class LidarConfig:
-    """What the sensor measures, how well, and who carries it."""
+    """What the sensor measures, how well, and what carries it."""
 
     point_rate: Annotated[float, Interval(gt=0, le=1e8)] = 200_000.0
-    """Rays a second (Livox)."""
+    """Rays per second (Livox)."""
     seconds: Annotated[float, Interval(gt=0, le=3600)] = 0.1
     """How long the sensor looks from each pose, s; Livox's usual frame."""
     elevation: Annotated[tuple[Latitude, Latitude], Ascending] = (-7.0, 52.0)

@@ -332,7 +332,7 @@ class A1Env(LocomotionEnv):
 
     def reward_terms(self) -> dict[str, Float[Tensor, "envs"]]:
         """Return each weighted term of the step just taken, per second."""
-        velocity = self.along_heading(self.pose, self.velocity)
+        velocity = self.crossings.along_heading(self.pose, self.velocity)
         wrong = (velocity - self.command[:, :2]).norm(dim=-1)
         turn = self.velocity[:, 2] - self.command[:, 2]
         # The error of a point ahead of the trunk: on the spot, turning wrongly is the only error.
