@@ -19,15 +19,15 @@ from PIL import Image
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, StorageError
 from fgtutor.execution import Episode
-from fgtutor.figures import maps, videos
+from fgtutor.figures import charts, maps, videos
 from fgtutor.fusion import fuse
-from fgtutor.pipeline import Plan
-from fgtutor.planning import plan
-from fgtutor.statistics import calibration
-from fgtutor.world.terrain import Terrain
+from fgtutor.planning import Plan, plan
+from fgtutor.statistics import Share, calibration
+from fgtutor.world.terrain import Section, Terrain
 
 NAMES = ("steps", "gaps")
 START, GOAL = (0.25, 0.45), (3.75, 0.55)
+PLACE = Section(name="ledge", x0=3.2, y0=0.2, x1=3.8, y1=0.8)
 
 
 def make_map() -> ElevationMap:
@@ -54,7 +54,7 @@ def planned(ground) -> Plan:
     route = plan(
         fused, policy_map, grid=ground, start=START, goal=GOAL, tensors=tensors, names=NAMES
     )
-    return Plan(NAMES, tensors, fused, policy_map, route)
+    return Plan(NAMES, tensors, {}, fused, policy_map, route)
 
 
 @pytest.fixture
@@ -233,18 +233,58 @@ def test_figures_draw_in_threads(ground, planned):
     assert all((picture == drawn[0]).all() for picture in drawn)
 
 
+def test_plans_lie_side_by_side_the_right_way_up(ground, planned):
+    tensor = planned.fused.clone()
+    tensor[30:] = 0.0
+    figure = maps.draw_plans(
+        ground,
+        {"early <1>": (tensor, None), "late": (tensor, planned.route)},
+        title="A & B",
+        f_min=0.25,
+        walls=np.arange(10) >= np.where(np.arange(40) == 3, 8, 10)[:, None],
+        places=[PLACE],
+    )
+    early, late = figure.axes
+    assert figure.get_suptitle() == "A & B"
+    assert early.get_title(loc="left") == "early <1>: no route"
+    assert late.get_title(loc="left") == f"late: {planned.route.length:.1f} m"
+    assert [len(axes.collections) for axes in (early, late)] == [0, 2]  # edges on a white border
+    assert [text.get_text() for text in early.texts] == ["20 cm high"]
+    image = np.asarray(early.images[0].get_array())  # [row = y from below, column = x]
+    assert image.shape == (10, 40, 3)
+    share = float(tensor[0, 0].mean())
+    np.testing.assert_allclose(image[0, 0], 1 - share * (1 - np.array(to_rgb(maps.FEASIBLE))))
+    np.testing.assert_allclose(image[0, 35], to_rgb(maps.CLOSED))
+    np.testing.assert_allclose(image[9, 3], to_rgb(maps.BLOCKED))
+
+
+def test_shares_lie_under_the_heading_of_their_group(tmp_path):
+    groups = {
+        "steps": {"ours": Share(successes=5, trials=10)},
+        "gaps <wide>": {"ours": Share(successes=0, trials=10), "b": Share(successes=9, trials=9)},
+    }
+    figure = charts.draw_shares(groups, title="Success")
+    assert [axes.get_title(loc="left") for axes in figure.axes] == list(groups)
+    bars = [[bar.get_width() for bar in axes.patches] for axes in figure.axes]
+    assert bars == [[0.5], [0.0, 1.0]]
+    names = [[label.get_text() for label in axes.get_yticklabels()] for axes in figure.axes]
+    assert names == [["ours"], ["ours", "b"]]
+    figure.savefig(tmp_path / "shares.svg")
+    assert (tmp_path / "shares.svg").read_text().count("of 10 -->") == 2
+
+
 @pytest.mark.parametrize("count", [1, 20])
 def test_the_training_curve_draws_what_it_is_given(count):
     rows = [{"samples": 100.0 * i, "r_v": i / 20, "row": 1.0} for i in range(count)]
-    curves = [line for axes in maps.training_curve(rows).axes for line in axes.lines]
+    curves = [line for axes in charts.training_curve(rows).axes for line in axes.lines]
     assert [len(line.get_xdata()) for line in curves] == [count, count]
     with pytest.raises(ConfigError, match="at least one row"):
-        maps.training_curve([])
+        charts.training_curve([])
 
 
 def test_the_calibration_plot_skips_empty_bins():
     table, error = calibration(np.array([0.05, 0.06, 0.95]), np.array([0.1, 0.0, 0.9]))
-    figure = maps.calibration_plot(table, error)
+    figure = charts.calibration_plot(table, error)
     _, dots = figure.axes[0].lines
     np.testing.assert_allclose(dots.get_xydata(), [(0.055, 0.05), (0.95, 0.9)])
     assert f"{error:.3f}" in figure.axes[0].get_title(loc="left")

@@ -144,7 +144,8 @@ def test_rates_show_wilson_intervals():
     axes = charts.draw_rates({"steps": (9, 10)}, title="t").axes[0]
     assert axes.patches[0].get_width() == pytest.approx(0.9)
     # Wilson (1927), 9 of 10: 0.596 to 0.982
-    assert list(axes.lines[0].get_xdata()) == pytest.approx([0.596, 0.982], abs=1e-3)
+    interval = axes.collections[0].get_segments()[0]
+    assert interval[:, 0].tolist() == pytest.approx([0.596, 0.982], abs=1e-3)
     assert "9 of 10" in [text.get_text() for text in axes.texts]
 
 

@@ -118,7 +118,7 @@ def test_the_command_writes_rows_and_a_report_and_prints_a_table(config, capsys)
         line in (folder / "table.md").read_text()
         and "12 trials in all" in (folder / "table.md").read_text()
     )
-    assert (folder / "figures" / "success.svg").read_text().count("<circle") == 4
+    assert (folder / "figures" / "success.svg").read_text().count(" of 3 -->") == 4
     # The second time everything is there: nothing to estimate, the same table.
     assert run(config) == 0
     again = capsys.readouterr().out

@@ -4,7 +4,6 @@ import re
 import shutil
 import time
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 
@@ -12,7 +11,6 @@ from fgtutor.errors import ReportError
 from fgtutor.evaluation.report import Findings, markdown, write_report
 from fgtutor.evaluation.shards import Run
 from fgtutor.evaluation.tasks import Result
-from fgtutor.figures.rates_svg import share_chart
 from fgtutor.statistics import Share
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "readme_table.py"
@@ -77,19 +75,6 @@ def test_a_report_keeps_every_trial_and_where_it_came_from(folder):
     assert (folder / "table.md").read_text() == (
         "# Success\n\n| a |\n| --- |\n| 100 |\n\nThree trials a cell. 3 trials in all.\n"
     )
-
-
-def test_the_chart_draws_every_share_where_it_lies():
-    groups = {
-        "steps": {"ours": Share(successes=5, trials=10)},
-        "gaps <wide>": {"ours": Share(successes=0, trials=10), "b": Share(successes=9, trials=9)},
-    }
-    chart = ElementTree.fromstring(share_chart(groups, "Success"))
-    dots = [float(mark.attrib["cx"]) for mark in chart.iter() if mark.tag.endswith("circle")]
-    # The axis runs from 200 to 616 px: 0 %, 50 % and 100 % lie at 200, 408 and 616.
-    assert dots == [408.0, 200.0, 616.0]
-    words = [mark.text for mark in chart.iter() if mark.tag.endswith("text")]
-    assert {"Success", "steps", "gaps <wide>", "ours", "100 %"} <= set(words)
 
 
 @pytest.fixture

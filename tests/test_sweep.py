@@ -247,7 +247,7 @@ def test_a_sweep_leaves_specialists_and_a_report(whole, capsys):
         assert specialist.provenance["seed"] == seed and specialist.provenance["iteration"] == 6
     text = (whole / "table.md").read_text()
     assert "| terrain | samples | seed 1 | seed 2 | mean |" in text and "4 trials in all" in text
-    assert (whole / "figures" / "success.svg").read_text().count("<circle") == 2
+    assert (whole / "figures" / "success.svg").read_text().count(" of 2 -->") == 2
     assert json.loads((whole / "run.json").read_text())["settings"]["train.iterations"] == 6
 
 

@@ -30,7 +30,7 @@ from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.success import terrain_seed
 from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.execution import execute_batch
-from fgtutor.figures.maps_svg import draw_maps
+from fgtutor.figures.maps import draw_plans
 from fgtutor.io.validation import Count, check_arguments
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.planning import plan, plan_on_map
@@ -346,16 +346,16 @@ def figures(
 ) -> dict[str, Draw]:
     """Return a map with route a checkpoint, drawn and as numbers."""
     plans = find_plans(first, zoo, config)
-    picture = draw_maps(
+    picture = draw_plans(
         first.elevation,
         plans,
         title="The better the policy, the shorter its route",
         f_min=config.f_min,
         walls=first.elevation.heights > WALL - 1e-3,
-        places=dict(zip(WAYS, first.sections, strict=True)),
+        places=first.sections,
     )
     stories = json.dumps({name: route and route.to_json() for name, (_, route) in plans.items()})
     return {
-        "maps.svg": partial(Path.write_text, data=picture),
+        "maps.svg": picture.savefig,
         "routes.json": partial(Path.write_text, data=stories),
     }

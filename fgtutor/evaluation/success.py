@@ -8,7 +8,6 @@ Source: paper, Sec. IV-B: 40 tasks of 250 trials a terrain, failures by reason.
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,7 +22,7 @@ from fgtutor.evaluation.report import Findings
 from fgtutor.evaluation.shards import collect, settings_of
 from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.evaluation.trials import Ground, drive
-from fgtutor.figures.rates_svg import share_chart
+from fgtutor.figures.charts import draw_shares
 from fgtutor.io.storage import check_writable, write_json
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.statistics import Share, wilson_interval
@@ -221,11 +220,11 @@ def run_and_report(
             f"Success in % with 95 % intervals, {config.count:,} trials a cell; robot "
             f"{config.robot}, protocol {config.protocol}, {config.planning}, seed {config.seed}."
         )
-        chart = share_chart(_shares(rows), title)
+        chart = draw_shares(_shares(rows), title=title)
         return Findings(
             table=table(trials),
             caption=f"{caption} {remark(trials)}" if remark else caption,
-            figures={"success.svg": partial(Path.write_text, data=chart)},
+            figures={"success.svg": chart.savefig},
         )
 
     return report.run_and_report(

@@ -33,7 +33,7 @@ from fgtutor.evaluation.shards import RunConfig, digest, settings_of
 from fgtutor.evaluation.success import TrialsConfig, by_cell, cut, make_ground
 from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.evaluation.trials import drive
-from fgtutor.figures.rates_svg import share_chart
+from fgtutor.figures.charts import draw_shares
 from fgtutor.io.machine import usable_cores
 from fgtutor.io.storage import make_folder
 from fgtutor.io.validation import Seed, Unique, parse_options
@@ -321,13 +321,13 @@ def run(config: SweepConfig) -> int:
             }
             for (terrain, setting), by_seed in _groups(rows)
         }
-        chart = share_chart(groups, title)
+        chart = draw_shares(groups, title=title)
         return Findings(
             table=table(rows, option),
             caption=f"Success in % with 95 % intervals, {config.trials} crossings of held-out "
             f"terrain a training, each with its own plan; r_v and calibration error there are "
             f"means over the seeds; robot {config.robot}{iterations}.",
-            figures={"success.svg": partial(Path.write_text, data=chart)},
+            figures={"success.svg": chart.savefig},
         )
 
     works = trainings(config)

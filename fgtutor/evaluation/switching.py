@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from statistics import fmean
 from typing import Annotated, TypeVar
 
@@ -30,7 +29,7 @@ from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.success import cut, terrain_seed
 from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.execution import FollowConfig, execute_batch
-from fgtutor.figures.rates_svg import share_chart
+from fgtutor.figures.charts import draw_shares
 from fgtutor.io.validation import Count, Unique, check_arguments
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.robots import ROBOTS
@@ -305,9 +304,9 @@ def charts(trials: Sequence[Row]) -> dict[str, Draw]:
             for course in dict.fromkeys(trial["course"] for trial in trials)
         }
         title = f"Fixes off by {100 * noise:g} cm, drift {100 * drift:g} cm per root second"
-        chart = share_chart(groups, title)
+        chart = draw_shares(groups, title=title)
         name = f"success-{100 * noise:g}-{100 * drift:g}.svg"
-        figures[name] = partial(Path.write_text, data=chart)
+        figures[name] = chart.savefig
     return figures
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 from numpy.typing import ArrayLike
 from torch import Tensor
 
@@ -19,7 +20,7 @@ from fgtutor.errors import ConfigError
 from fgtutor.feasibility import ood_weight
 from fgtutor.figures.canvas import POLICY_COLOURS, TITLE, Picture
 from fgtutor.io.validation import Positive, check_arguments
-from fgtutor.statistics import wilson_interval
+from fgtutor.statistics import Share
 from fgtutor.world.terrain import Terrain
 
 if TYPE_CHECKING:
@@ -84,22 +85,33 @@ def draw_losses(
 
 
 def draw_rates(counts: Mapping[str, tuple[int, int]], *, title: str) -> Picture:
-    """Draw success rates (successes, trials) with their 95 % Wilson intervals."""
-    figure = Picture(7.0, 0.9 + 0.42 * len(counts))
-    axes = figure.subplots()
-    for place, ((name, (successes, trials)), colour) in enumerate(
-        zip(counts.items(), colours_of(counts), strict=True)
-    ):
-        low, high = wilson_interval(successes, trials)
-        axes.barh(place, successes / trials, color=colour, alpha=0.55, height=0.6)
-        axes.plot((low, high), (place, place), color=INK, linewidth=2)
-        axes.text(1.02, place, f"{successes} of {trials}", va="center", fontsize=9)
-        axes.text(-0.01, place, name, va="center", ha="right", fontsize=9)
-    axes.set(
-        xlim=(0, 1), yticks=(), xlabel="share that reached the goal; the line is the 95 % interval"
-    )
-    axes.invert_yaxis()
-    axes.set_title(title, **TITLE, loc="left")
+    """Draw success rates (successes, trials) with their 95 % intervals."""
+    shares = {name: Share(successes=won, trials=n) for name, (won, n) in counts.items()}
+    return draw_shares({"": shares}, title=title)
+
+
+def draw_shares(groups: Mapping[str, Mapping[str, Share]], *, title: str) -> Picture:
+    """Draw groups of success rates with their 95 % intervals, each group under its heading."""
+    rows = [len(shares) for shares in groups.values()]
+    figure = Picture(7.0, 1.0 + 0.3 * sum(rows) + 0.3 * len(rows))
+    panels = figure.subplots(len(rows), sharex=True, squeeze=False, height_ratios=rows)[:, 0]
+    for axes, (group, shares) in zip(panels, groups.items(), strict=True):
+        places = range(len(shares))
+        low, high = zip(*(share.interval for share in shares.values()), strict=True)
+        rates = [share.successes / share.trials for share in shares.values()]
+        axes.barh(places, rates, color=colours_of(shares), alpha=0.55, height=0.6)
+        axes.hlines(places, low, high, color=INK, linewidth=2)
+        for place, share in zip(places, shares.values(), strict=True):
+            label = f"{share.successes} of {share.trials}"
+            axes.text(1.02, place, label, va="center", fontsize=9)
+        axes.set_yticks(places, shares, fontsize=9)
+        axes.tick_params(axis="y", length=0)
+        axes.set(xlim=(0, 1))
+        axes.xaxis.set_major_formatter(PercentFormatter(1.0))
+        axes.invert_yaxis()
+        axes.set_title(group, fontsize=9.5, loc="left")
+    panels[-1].set_xlabel("share that reached the goal; the line is the 95 % interval")
+    figure.suptitle(title, **TITLE, x=0.01)
     return figure
 
 
@@ -178,4 +190,50 @@ def draw_labels(
     axes.set(xlabel="time (s)", ylabel="r_v", ylim=(0, 1.02), xlim=(0, t[-1]))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=3, frameon=False, fontsize=9)
     axes.set_title("A label looks ahead", **TITLE, loc="left", y=1.08)
+    return figure
+
+
+def training_curve(rows: Sequence[Mapping[str, float]]) -> Picture:
+    """Draw what training reported (`on_iteration`, or a specialist's provenance["curve"])."""
+    if not rows:
+        raise ConfigError("training_curve needs at least one row: let the training run longer")
+    figure = Picture(7.0, 6.5)
+    tracking, level, loss = figure.subplots(3, 1, sharex=True)
+    samples = np.array([row["samples"] for row in rows])
+    for axes, key, label, colour in (
+        (tracking, "r_v", "tracking reward r_v", "#0072B2"),
+        (tracking, "failed", "share of episodes that fail", "#D55E00"),
+        (level, "row", "mean difficulty row", "#009E73"),
+        (loss, "feasibility_feasibility", "(f - r_v)²", "#0072B2"),
+        (loss, "feasibility_reconstruction", "L_recon", "#E69F00"),
+    ):
+        if all(key in row for row in rows):
+            values = [row[key] for row in rows]
+            axes.plot(samples, values, ".-" if len(rows) < 3 else "-", color=colour, label=label)
+            axes.legend(loc="best", fontsize=8, frameon=False)
+        axes.grid(alpha=0.25)
+    tracking.set(ylim=(0, 1.02))
+    tracking.set_title("The policy learns to track its command ...", **TITLE, loc="left")
+    level.set(ylim=(0, None))
+    level.set_title("... on ever harder ground ...", **TITLE, loc="left")
+    loss.set(yscale="log", xlabel="samples")
+    loss.set_title("... and its Feasibility-Net learns from the same data", **TITLE, loc="left")
+    return figure
+
+
+def calibration_plot(table: Float[np.ndarray, "bins 3"], error: float) -> Picture:
+    """Draw predicted against measured feasibility, from `statistics.calibration`."""
+    figure = Picture(5.0, 6.2)
+    axes, counts = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
+    predicted, measured, count = np.asarray(table, dtype=float).T
+    filled = count > 0
+    axes.plot((0, 1), (0, 1), "--", color="grey", label="perfect: what is promised comes true")
+    axes.plot(predicted[filled], measured[filled], "o-", color="#0072B2", label="this network")
+    axes.vlines(predicted[filled], predicted[filled], measured[filled], color="#D55E00", alpha=0.6)
+    axes.set(xlim=(0, 1), ylim=(0, 1), ylabel="measured r_v")
+    axes.legend(loc="upper left", frameon=False, fontsize=9)
+    axes.set_title(f"Calibration: off by {error:.3f} on average", **TITLE, loc="left")
+    edges = np.linspace(0, 1, len(count) + 1)
+    counts.bar(edges[:-1], count, np.diff(edges), align="edge", color="#9DB8C9", edgecolor="white")
+    counts.set(xlabel="predicted feasibility f", ylabel="patches")
     return figure

@@ -1,6 +1,6 @@
 """Pictures of everything between a map and a route, for notebooks, files and threads alike.
 
-Reads maps, tensors [nx, ny, 8], plans and training rows; gives matplotlib figures that a notebook
+Reads maps, tensors [nx, ny, 8] and plans; gives matplotlib figures that a notebook
 shows by themselves.
 Source: the quantities of the paper's Sec. III; the 8-petal glyphs are ours.
 
@@ -9,18 +9,19 @@ Arrays are [ix, iy], but an image has y first: the transposes are here and nowhe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import FuncNorm, LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import FixedLocator, FuncFormatter
 from numpy.typing import ArrayLike
 
@@ -33,20 +34,20 @@ from fgtutor.io.validation import Count, check_arguments
 if TYPE_CHECKING:
     from fgtutor.planning import Plan
     from fgtutor.routes import Route
+    from fgtutor.world.terrain import Section
 
 __all__ = [
     "POLICY_COLOURS",
     "Picture",
-    "calibration_plot",
     "draw_elevation",
     "draw_petals",
+    "draw_plans",
     "draw_policy_map",
     "draw_route",
     "draw_weight",
     "plan_figure",
     "policy_colours",
     "save_figure",
-    "training_curve",
 ]
 
 HEADING_COLOURS = (
@@ -55,6 +56,8 @@ HEADING_COLOURS = (
 """One colour a heading, in a circle: neighbours resemble each other."""
 BLOCKED, UNKNOWN = "#33363B", "#C4C4C4"
 """Cells that no policy may leave, and cells that were never observed."""
+FEASIBLE, CLOSED = "#0072B2", "#D9D9D9"
+"""The same where walls are dark: full feasibility, and cells that no policy may leave."""
 GROUND = LinearSegmentedColormap.from_list(
     "ground", ["#16324A", "#5F87A6", "#F4F1EA", "#B08D5E", "#4F3517"]
 )
@@ -67,11 +70,11 @@ GLYPHS = 36
 
 # One object, one picture --------------------------------------------------------------------------
 # Each draws on the axes it is given, else on a picture of its own, and returns the whole figure.
+# `bare` leaves out title, labels, colour bar and legend, for pictures that write their own.
 
 
-def draw_elevation(elevation: ElevationMap, *, axes: Axes | None = None) -> Figure:
-    """Draw the heights of a map, in relief; cells that were never observed are hatched."""
-    axes = _stage(elevation, axes)
+def relief(elevation: ElevationMap) -> tuple[Float[np.ndarray, "nx ny 3"], FuncNorm]:
+    """Return a map's cells in the colours of `GROUND`, shaded, and the scale of the colours."""
     heights = elevation.filled().heights.astype(np.float64)
     usual = float(np.median(heights[elevation.known]))
     reach = max(float(np.abs(heights - usual).max()), DETAIL)
@@ -84,10 +87,22 @@ def draw_elevation(elevation: ElevationMap, *, axes: Axes | None = None) -> Figu
     # Light from the upper left: ground that rises to the right or falls towards the top is bright.
     rise_x, rise_y = np.gradient(heights, elevation.resolution)
     light = 1 + 0.25 * np.tanh((rise_x - rise_y) / 2)
-    colours = GROUND(norm(heights))[..., :3] * light[..., None]
-    _show(axes, elevation, np.clip(colours, 0, 1))
+    return np.clip(GROUND(norm(heights))[..., :3] * light[..., None], 0, 1), norm
+
+
+def draw_elevation(
+    elevation: ElevationMap, *, axes: Axes | None = None, bare: bool = False
+) -> Figure:
+    """Draw the heights of a map, in relief; cells that were never observed are hatched."""
+    axes = _stage(elevation, axes)
+    colours, norm = relief(elevation)
+    _show(axes, elevation, colours)
     _hatch_unknown(axes, elevation)
+    if bare:
+        return _root(axes)
     bar = _root(axes).colorbar(ScalarMappable(norm, GROUND), ax=axes, shrink=0.8, pad=0.01)
+    low, high = norm.vmin or 0.0, norm.vmax or 0.0
+    usual, reach = (high + low) / 2, (high - low) / 2
     marks = np.array([0.05, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
     marks = marks[marks <= reach * 1.001][-4:]
     bar.locator = FixedLocator([*(usual - marks), usual, *(usual + marks)])
@@ -99,42 +114,33 @@ def draw_elevation(elevation: ElevationMap, *, axes: Axes | None = None) -> Figu
     return _root(axes)
 
 
-def draw_route(route: Route, elevation: ElevationMap, *, axes: Axes | None = None) -> Figure:
+def draw_route(
+    route: Route, elevation: ElevationMap, *, axes: Axes | None = None, bare: bool = False
+) -> Figure:
     """Draw a route in the colours of its policies: on the map, or on top of what `axes` hold."""
     if axes is None:
         axes = _stage(elevation, None)
-        draw_elevation(elevation, axes=axes)
+        draw_elevation(elevation, axes=axes, bare=bare)
     colours = policy_colours(route.names)
-    edges = np.stack((route.xy[:-1], route.xy[1:]), axis=1)
-    axes.add_collection(LineCollection(list(edges), colors="white", linewidths=6, capstyle="round"))
-    axes.add_collection(
-        LineCollection(
-            list(edges),
-            colors=[colours[route.names[policy]] for policy in route.policies],
-            linewidths=3.2,
-            capstyle="round",
+    ends = _paint_route(axes, route, [colours[route.names[policy]] for policy in route.policies])
+    if not bare:
+        used = {name: colours[name] for i, name in enumerate(route.names) if i in route.policies}
+        _legend(axes, used, ends)
+        _say(
+            axes,
+            "The route, coloured by the policy that drives it",
+            f"{route.length:.1f} m, cost {route.cost:.1f}, policy switches: {route.switches}",
         )
-    )
-    used = [name for i, name in enumerate(route.names) if i in route.policies]
-    ends = []
-    for (x, y), marker, size, role in (
-        (route.xy[0], "o", 9, "start"),
-        (route.xy[-1], "*", 15, "goal"),
-    ):
-        style = {"marker": marker, "markersize": size, "color": "white", "markeredgecolor": "black"}
-        axes.plot([x], [y], linestyle="none", zorder=5, **style)
-        ends.append(Line2D([], [], linestyle="none", label=role, **style))
-    _legend(axes, {name: colours[name] for name in used}, ends)
-    _say(
-        axes,
-        "The route, coloured by the policy that drives it",
-        f"{route.length:.1f} m, cost {route.cost:.1f}, policy switches: {route.switches}",
-    )
     return _root(axes)
 
 
 def draw_weight(
-    w_ood: ArrayLike, grid: ElevationMap, name: str = "general", *, axes: Axes | None = None
+    w_ood: ArrayLike,
+    grid: ElevationMap,
+    name: str = "general",
+    *,
+    axes: Axes | None = None,
+    bare: bool = False,
 ) -> Figure:
     """Draw w_ood, the mean over the headings: where a policy has seen terrain like this before."""
     axes = _stage(grid, axes)
@@ -142,7 +148,9 @@ def draw_weight(
     own = np.array(to_rgb(policy_colours([name])[name]))
     _show(axes, grid, 1 - weight[..., None] * (1 - own))
     _hatch_unknown(axes, grid)
-    _say(axes, f"w_ood of {name!r}", "Full colour (1): knows such ground. White (0): not at all")
+    if not bare:
+        caption = "Full colour (1): knows such ground. White (0): not at all"
+        _say(axes, f"w_ood of {name!r}", caption)
     return _root(axes)
 
 
@@ -210,6 +218,7 @@ def draw_policy_map(
     *,
     f_min: float = 0.1,
     axes: Axes | None = None,
+    bare: bool = False,
 ) -> Figure:
     """Draw P [nx, ny, 8]: in each cell the policy of its best heading, paler where F is low."""
     axes = _stage(grid, axes)
@@ -222,12 +231,13 @@ def draw_policy_map(
     colours[blocked] = to_rgb(BLOCKED)
     _show(axes, grid, colours)
     _hatch_unknown(axes, grid)
-    _legend(axes, policy_colours(names) | ({"blocked": BLOCKED} if blocked.any() else {}))
-    _say(
-        axes,
-        "Policy map P: who would drive here",
-        f"Paler: less feasible. Blocked: no heading reaches F = {f_min:g}",
-    )
+    if not bare:
+        _legend(axes, policy_colours(names) | ({"blocked": BLOCKED} if blocked.any() else {}))
+        _say(
+            axes,
+            "Policy map P: the best policy in each cell",
+            f"Paler: less feasible. Blocked: no heading reaches F = {f_min:g}",
+        )
     return _root(axes)
 
 
@@ -257,9 +267,8 @@ def plan_figure(
     )
     small = panels[0, 1].subplots(rows, columns, squeeze=False).ravel()
     for axes, name in zip(small, plan.names, strict=False):
-        draw_weight(weights[name], elevation, name, axes=axes)
+        draw_weight(weights[name], elevation, name, axes=axes, bare=True)
         axes.set_title(name, **TITLE | {"color": policy_colours([name])[name]}, loc="left")
-        axes.set(xlabel="", ylabel="")
     for axes in small[len(plan.names) :]:
         axes.remove()
     third, fourth = panels[1, 0].subplots(), panels[1, 1].subplots()
@@ -270,52 +279,53 @@ def plan_figure(
     return figure
 
 
-# Training -----------------------------------------------------------------------------------------
+def draw_plans(
+    elevation: ElevationMap,
+    plans: Mapping[str, tuple[ArrayLike, Route | None]],
+    *,
+    title: str,
+    f_min: float,
+    walls: Bool[np.ndarray, "nx ny"],
+    places: Iterable[Section],
+) -> Picture:
+    """Draw the same map once per plan, with its F [nx, ny, 8] and its route, side by side.
 
-
-def training_curve(rows: Sequence[Mapping[str, float]]) -> Picture:
-    """Draw what training reported (`on_iteration`, or a specialist's provenance["curve"])."""
-    if not rows:
-        raise ConfigError("training_curve needs at least one row: let the training run longer")
-    figure = Picture(7.0, 6.5)
-    tracking, level, loss = figure.subplots(3, 1, sharex=True)
-    samples = np.array([row["samples"] for row in rows])
-    for axes, key, label, colour in (
-        (tracking, "r_v", "tracking reward r_v", "#0072B2"),
-        (tracking, "failed", "share of episodes that fail", "#D55E00"),
-        (level, "row", "mean difficulty row", "#009E73"),
-        (loss, "feasibility_feasibility", "(f - r_v)²", "#0072B2"),
-        (loss, "feasibility_reconstruction", "L_recon (m²)", "#E69F00"),
-    ):
-        if all(key in row for row in rows):
-            values = [row[key] for row in rows]
-            axes.plot(samples, values, ".-" if len(rows) < 3 else "-", color=colour, label=label)
-            axes.legend(loc="best", fontsize=8, frameon=False)
-        axes.grid(alpha=0.25)
-    tracking.set(ylim=(0, 1.02))
-    tracking.set_title("The policy learns to track its command ...", **TITLE, loc="left")
-    level.set(ylim=(0, None))
-    level.set_title("... on ever harder ground ...", **TITLE, loc="left")
-    loss.set(yscale="log", xlabel="samples")
-    loss.set_title("... and its Feasibility-Net learns from the same data", **TITLE, loc="left")
-    return figure
-
-
-def calibration_plot(table: Float[np.ndarray, "bins 3"], error: float) -> Picture:
-    """Draw predicted against measured feasibility, from `evaluation.metrics.calibration`."""
-    figure = Picture(5.0, 6.2)
-    axes, counts = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
-    predicted, measured, count = np.asarray(table, dtype=float).T
-    filled = count > 0
-    axes.plot((0, 1), (0, 1), "--", color="grey", label="perfect: what is promised comes true")
-    axes.plot(predicted[filled], measured[filled], "o-", color="#0072B2", label="this network")
-    axes.vlines(predicted[filled], predicted[filled], measured[filled], color="#D55E00", alpha=0.6)
-    axes.set(xlim=(0, 1), ylim=(0, 1), ylabel="measured r_v")
-    axes.legend(loc="upper left", frameon=False, fontsize=9)
-    axes.set_title(f"Calibration: off by {error:.3f} on average", **TITLE, loc="left")
-    edges = np.linspace(0, 1, len(count) + 1)
-    counts.bar(edges[:-1], count, np.diff(edges), align="edge", color="#9DB8C9", edgecolor="white")
-    counts.set(xlabel="predicted feasibility f", ylabel="patches")
+    F is shown as its mean over the headings; a cell is closed where none reaches `f_min`.
+    `places` are framed, and the height of what lies there is written below them.
+    """
+    width, height = _size(elevation, 3.2)
+    figure = Picture(max(len(plans) * width, 6.4), height + 0.5)
+    panels = figure.subplots(1, len(plans), sharey=True, squeeze=False)[0]
+    for axes, (name, (fused, route)) in zip(panels, plans.items(), strict=True):
+        _stage(elevation, axes)
+        tensor = _fit("F", fused, elevation)
+        colours = 1 - tensor.mean(axis=-1)[..., None] * (1 - np.array(to_rgb(FEASIBLE)))
+        colours[tensor.max(axis=-1) < f_min] = to_rgb(CLOSED)
+        colours[walls] = to_rgb(BLOCKED)
+        _show(axes, elevation, colours)
+        for place in places:
+            corner, size = (place.x0, place.y0), (place.x1 - place.x0, place.y1 - place.y0)
+            axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=BLOCKED))
+            top = elevation.crop(place.x0, place.y0, place.x1, place.y1).heights.max()
+            axes.text(
+                (place.x0 + place.x1) / 2,
+                place.y0 - 0.1,
+                f"{100 * top:.0f} cm high",
+                ha="center",
+                va="top",
+                fontsize=8,
+                color="white",
+                path_effects=[Stroke(linewidth=3, foreground=BLOCKED), Normal()],
+            )
+        if route is not None:
+            _paint_route(axes, route, ["#D55E00"] * len(route.policies))
+        found = "no route" if route is None else f"{route.length:.1f} m"
+        axes.set_title(f"{name}: {found}", **TITLE, loc="left")
+    figure.suptitle(title, **TITLE, x=0.01)
+    figure.supxlabel(
+        "in metres; blue: feasibility, mean of 8 headings; grey: closed; dark: wall; star: goal",
+        fontsize=9,
+    )
     return figure
 
 
@@ -331,7 +341,7 @@ def _stage(grid: ElevationMap, axes: Axes | None) -> Axes:
     """Return axes in metres with the map's frame, on a new picture if there are none."""
     axes = axes or Picture(*_size(grid, 7.2)).subplots()
     x0, y0, x1, y1 = grid.extent
-    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", ylabel="y (m)")
+    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
     axes.tick_params(labelsize=8)
     return axes
 
@@ -348,6 +358,7 @@ def _say(axes: Axes, title: str, caption: str) -> None:
     """Write what is drawn above the picture, and what to see in it below."""
     axes.set_title(title, **TITLE, loc="left")
     axes.set_xlabel(f"x (m)\n{caption}", fontsize=9)
+    axes.set_ylabel("y (m)")
 
 
 def _legend(axes: Axes, colours: Mapping[str, str], more: Sequence[Line2D] = ()) -> None:
@@ -373,6 +384,22 @@ def _show(axes: Axes, grid: ElevationMap, colours: Float[np.ndarray, "nx ny 3"])
     axes.imshow(
         colours.transpose(1, 0, 2), origin="lower", extent=(x0, x1, y0, y1), interpolation="nearest"
     )
+
+
+def _paint_route(axes: Axes, route: Route, colours: Sequence[str]) -> list[Line2D]:
+    """Draw a route, one colour per edge; return its start and goal for a legend."""
+    edges = list(np.stack((route.xy[:-1], route.xy[1:]), axis=1))
+    for line in ({"colors": "white", "linewidths": 6}, {"colors": colours, "linewidths": 3.2}):
+        axes.add_collection(LineCollection(edges, capstyle="round", **line))
+    ends = []
+    for (x, y), marker, size, role in (
+        (route.xy[0], "o", 9, "start"),
+        (route.xy[-1], "*", 15, "goal"),
+    ):
+        style = {"marker": marker, "markersize": size, "color": "white", "markeredgecolor": "black"}
+        axes.plot([x], [y], linestyle="none", zorder=5, **style)
+        ends.append(Line2D([], [], linestyle="none", label=role, **style))
+    return ends
 
 
 def _hatch_unknown(axes: Axes, grid: ElevationMap) -> None:

@@ -155,7 +155,7 @@ test = collect(exam, roll, seconds=8.0)
 measured, valid = feasibility_labels(test["tracking"], window=round(1.0 / exam.control_dt))
 
 # %%
-from fgtutor.figures.maps import calibration_plot
+from fgtutor.figures.charts import calibration_plot
 from fgtutor.statistics import calibration
 
 with torch.no_grad():
@@ -266,7 +266,7 @@ draw_curves(
 # losses, and **no shared weights**: the net watches, and never disturbs.
 
 # %%
-from fgtutor.figures.maps import training_curve
+from fgtutor.figures.charts import training_curve
 
 training_curve(steps.provenance["curve"])
 

@@ -23,7 +23,7 @@
 
 # %%
 from fgtutor import load_zoo
-from fgtutor.figures.maps import training_curve
+from fgtutor.figures.charts import training_curve
 
 steps = load_zoo("a1")["steps"]
 record = steps.provenance
@@ -266,7 +266,7 @@ draw_rates(passed, title="Who crosses steps it has never seen?")
 
 # %%
 from fgtutor.evaluation.calibration import CalibrationConfig, drive
-from fgtutor.figures.maps import calibration_plot
+from fgtutor.figures.charts import calibration_plot
 from fgtutor.statistics import calibration
 
 envs = budget(fast=16, full=80, unit="robots, 5 s each", each=0.5)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 from IPython.display import display
 
-from fgtutor.figures.maps import training_curve
+from fgtutor.figures.charts import training_curve
 
 
 class LiveCurve:
