@@ -20,10 +20,11 @@ from tqdm import tqdm
 
 from fgtutor.errors import ConfigError
 from fgtutor.io.validation import Count, Unbounded, check_fields
-from fgtutor.planning import Route
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.robots.crossings import LOOKAHEAD
+from fgtutor.routes import Refusal, Route
+from fgtutor.settings import PlanSettings
 from fgtutor.specialist import Specialist
 from fgtutor.world.terrain import Terrain, World
 
@@ -49,7 +50,7 @@ class FollowConfig:
     """Seconds added to the time limit."""
     stuck_seconds: Unbounded = 10.0
     """A robot that has come no further on its route for this long has run out of time too, s."""
-    hold_steps: Count = 3
+    hold_steps: Count = PlanSettings.hold_steps
     """Hysteresis: a policy takes over once it has been wanted for this many control steps."""
     start_noise: Magnitude = 0.03
     """Standard deviation of the start position, m."""
@@ -98,7 +99,7 @@ class Episode:
 
 
 def execute(
-    route: Route,
+    route: Route | Refusal,
     terrain: Terrain,
     zoo: Mapping[str, Specialist],
     *,
@@ -106,9 +107,18 @@ def execute(
     config: FollowConfig | None = None,
     progress: bool = False,
 ) -> Episode:
-    """Drive one route and record the robot's body, so that the episode can be drawn."""
+    """Drive one route and record the robot's body, so that the episode can be drawn.
+
+    Raises what `execute_batch` raises, and the `PlanningError` of a `Refusal`.
+    """
     return execute_batch(
-        [route], [terrain], zoo, seeds=[seed], config=config, record_body=True, progress=progress
+        [route.raise_for()],
+        [terrain],
+        zoo,
+        seeds=[seed],
+        config=config,
+        record_body=True,
+        progress=progress,
     )[0]
 
 
@@ -198,7 +208,7 @@ class _Drive:
         self.env, self.specialists, self.config = env, specialists, config
         self.tracks = tracks
         self.corners = env.offsets[0, tiles].cpu().numpy().astype(np.float64)
-        self.dice = [np.random.default_rng(seed) for seed in seeds]
+        self.rngs = [np.random.default_rng(seed) for seed in seeds]
         self.limits = np.array(
             [
                 (config.patience * track.length / speed + config.grace) / env.control_dt
@@ -211,11 +221,11 @@ class _Drive:
         self.waiting = np.zeros(n, dtype=int)
         starts = [
             (
-                *(track.points[0] + corner + config.start_noise * dice.standard_normal(2)),
+                *(track.points[0] + corner + config.start_noise * rng.standard_normal(2)),
                 track.bearing(track.points[0], config.lookahead)
-                + config.start_yaw_noise * dice.standard_normal(),
+                + config.start_yaw_noise * rng.standard_normal(),
             )
-            for track, corner, dice in zip(self.tracks, self.corners, self.dice, strict=True)
+            for track, corner, rng in zip(self.tracks, self.corners, self.rngs, strict=True)
         ]
         poses = torch.tensor(np.array(starts), dtype=torch.float32)
         env.start(torch.arange(n), poses, speed, columns=tiles)
@@ -277,7 +287,7 @@ class _Drive:
         """Command (v, 0, w) by pure pursuit from where each robot believes it is."""
         config, n = self.config, len(self.tracks)
         if config.drift or config.position_noise:
-            fixes = np.array([dice.standard_normal((2, 2)) for dice in self.dice])
+            fixes = np.array([rng.standard_normal((2, 2)) for rng in self.rngs])
             self.error += config.drift * math.sqrt(self.env.control_dt) * fixes[:, 0]
             believed = pose[:, :2] + self.error + config.position_noise * fixes[:, 1]
         else:
@@ -338,7 +348,7 @@ class _Track:
     def bearing(self, place: np.ndarray, distance: float, there: float = 0.0) -> float:
         """Return the direction to the point `distance` metres further along, or to the end, rad.
 
-        `there` is the answer for who stands on that point.
+        `there` is the answer where `place` is that point.
         """
         ahead = min(self.nearest + round(distance / self.SPACING), len(self.points) - 1)
         aim = self.points[ahead] - place

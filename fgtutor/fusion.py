@@ -1,6 +1,6 @@
-"""Fuse the feasibility tensors of all specialists: the best feasibility and whose it is.
+"""Fuse the feasibility tensors of all specialists: the highest feasibility, and its policy.
 
-Reads F_i [nx, ny, 8], one a specialist; gives F_max and the policy map P, both [nx, ny, 8].
+Reads F_i [nx, ny, 8], one per specialist; gives F_max and the policy map P, both [nx, ny, 8].
 Source: paper, Sec. III-C (Eqs. 6-7).
 """
 

@@ -116,7 +116,7 @@ def reversed_graph(
 
     States are (layer, ix, iy), flattened; a value of 0 is no edge. Costs are those of
     `as_networkx`, and of `as_switching_networkx` where there are several layers. An edge for every
-    pair of policies and heading would be 8 K^2 a cell. Mostly the old policy can take every step
+    pair of policies and heading would be 8 K^2 per cell. Mostly the old policy can take every step
     that the new one can: then one edge, which stays in the cell, changes the policy for all of
     them. Raises `TooLargeError` if the graph does not fit into memory.
     """

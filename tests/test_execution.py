@@ -74,6 +74,7 @@ def test_it_starts_towards_where_it_will_steer_not_along_the_first_cell(make_rol
     assert episode.poses[0, 3] == pytest.approx(math.atan2(0.2, 0.37), abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_ledge_is_a_time_out_and_a_gap_is_a_fall(make_rolling):
     ledge, gap = np.zeros((60, 40)), np.zeros((60, 40))
     ledge[30:], gap[30:34] = 0.2, -1.0
@@ -111,6 +112,7 @@ def test_a_batch_gives_what_single_trials_give(make_rolling):
         assert alone.poses[:20] == pytest.approx(together[index].poses[:20], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_trials_on_one_terrain_share_a_tile_and_do_not_meet(make_rolling, monkeypatch):
     worlds, make = [], execution.World
     monkeypatch.setattr(execution, "World", lambda tiles: worlds.append(tiles) or make(tiles))
