@@ -8,7 +8,7 @@ import torch
 from fgtutor import execution
 from fgtutor.directions import STEPS
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError
+from fgtutor.errors import ConfigError, InfeasibleCellError
 from fgtutor.execution import FollowConfig, execute, execute_batch
 from fgtutor.planning import plan
 from fgtutor.world.terrain import Terrain, make_terrain
@@ -171,6 +171,15 @@ def test_a_route_of_one_cell_is_reached_at_once(make_rolling):
     route, terrain = task((2.0, 2.0), (2.0, 2.0))
     episode = execute(route, terrain, {"roll": make_rolling()})
     assert episode.success and len(episode.poses) == 1
+
+
+def test_a_refusal_is_not_driven_but_says_why(make_rolling):
+    elevation = ElevationMap(np.zeros((9, 9)))
+    closed = np.zeros((9, 9, 8))
+    terrain = Terrain.from_elevation(elevation, (0.15, 0.15), (0.75, 0.75))
+    refusal = plan(closed, closed, grid=elevation, start=terrain.start, goal=terrain.goal)
+    with pytest.raises(InfeasibleCellError, match="no policy can leave the start"):
+        execute(refusal, terrain, {"roll": make_rolling()})
 
 
 def test_no_routes_no_episodes(make_rolling):
