@@ -7,11 +7,11 @@ Source: paper, Sec. III-B (Eqs. 4-5).
 Two ways lead to the same numbers. The *reference* cuts every patch with `sample_patches`, as
 training does. The *fast* way turns the loop inside out: seen from all cells at once, one point of
 the patch is the whole map, shifted. So the network's first layer, a weighted sum of patch points,
-is a weighted sum of shifted maps: a convolution of M. It is evaluated as one matrix product
-per strip of the map, with a shifted strip as each row, so that memory stays flat. A convolution routine was
-no faster along the axes and slower along the diagonals, where the turned kernel has two to eight
-times more taps (at cells of 0.1 and 0.05 m) than the patch has points. Equal patches are assessed
-once.
+is a weighted sum of shifted maps: a convolution of M. It is evaluated as one matrix product per
+strip of the map, with a shifted strip as each row, so that memory stays flat. A convolution routine
+was no faster along the axes and slower along the diagonals, where the turned kernel has two to
+eight times more taps (at cells of 0.1 and 0.05 m) than the patch has points. Equal patches are
+assessed once.
 """
 
 from __future__ import annotations
