@@ -5,7 +5,7 @@ heights at points and derived maps. Source: the paper's M in R^(W x H), Sec. III
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -85,11 +85,10 @@ class ElevationMap:
 
     def __repr__(self) -> str:
         """Say what a person wants to know about a map, in one line."""
-        low, high = np.nanmin(self.heights), np.nanmax(self.heights)
-        unknown = int((~self.known).sum())
+        (nx, ny), low, high = self.shape, np.nanmin(self.heights), np.nanmax(self.heights)
         return (
-            f"ElevationMap({self.shape[0]} x {self.shape[1]} cells of {self.resolution:g} m from "
-            f"{self.origin}, heights {low:.2f}..{high:.2f} m, {unknown} unknown)"
+            f"ElevationMap({nx} x {ny} cells of {self.resolution:g} m from {self.origin}, heights "
+            f"{low:.2f}..{high:.2f} m, {(~self.known).sum()} unknown)"
         )
 
     @property
@@ -178,7 +177,7 @@ class ElevationMap:
         if self.known.all():
             return self
         _, (ix, iy) = ndimage.distance_transform_edt(~self.known, return_indices=True)  # pyright: ignore
-        return self._replace(self.heights[ix, iy], known=self.known)
+        return replace(self, heights=self.heights[ix, iy])
 
     def levelled(self, depth: NonNegative, reach: NonNegative) -> Self:
         """Return the map with deep holes raised to `depth` below the ground around them.
@@ -197,16 +196,12 @@ class ElevationMap:
             raise MapError("levelled needs a height in every cell: call filled() first")
         cells = round(min(reach / self.resolution, 1e9))
         check_cells([4 * cells] * 2)  # what is laid around the map
-        square = (2 * cells + 1, 2 * cells + 1)
         # Closed on a padded map: scipy's own border would erode what it has just dilated.
         padded = np.pad(self.heights, 2 * cells, mode="edge")
-        closed = ndimage.grey_erosion(ndimage.grey_dilation(padded, size=square), size=square)
-        inside = tuple(slice(2 * cells, 2 * cells + n) for n in self.shape)
-        highest = closed[inside]
-        return self._replace(
-            np.maximum(self.heights, highest - np.float32(min(depth, 2 * _HIGHEST))),
-            known=self.known,
-        )
+        closed = ndimage.grey_closing(padded, size=(2 * cells + 1, 2 * cells + 1))
+        highest = closed[tuple(slice(2 * cells, 2 * cells + n) for n in self.shape)]
+        floor = highest - np.float32(min(depth, 2 * _HIGHEST))
+        return replace(self, heights=np.maximum(self.heights, floor))
 
     def smoothed(self, width: NonNegative) -> Self:
         """Return the map seen through a triangular window that reaches `width` to each side, m.
@@ -234,7 +229,7 @@ class ElevationMap:
         heights = self.heights.astype(np.float64)
         for axis in (0, 1):
             heights = ndimage.convolve1d(heights, window, axis=axis, mode="nearest")
-        return self._replace(heights, known=self.known)
+        return replace(self, heights=heights)
 
     def crop(self, x0: float, y0: float, x1: float, y1: float) -> Self:
         """Return the cells whose centres lie in the rectangle, which may reach beyond the map.
@@ -256,11 +251,12 @@ class ElevationMap:
                 "2 are needed"
             )
         window = slice(low[0], high[0] + 1), slice(low[1], high[1] + 1)
-        corner_x, corner_y = self.centre_of(int(low[0]), int(low[1]))
-        return self._replace(
-            self.heights[window],
+        x, y = self.centre_of(int(low[0]), int(low[1]))
+        return replace(
+            self,
+            heights=self.heights[window],
             known=self.known[window],
-            origin=(corner_x - half, corner_y - half),
+            origin=(x - half, y - half),
         )
 
     def rotated90(self, k: int = 1) -> Self:
@@ -277,14 +273,8 @@ class ElevationMap:
         x0, y0, x1, y1 = self.extent
         origin = ((x0, y0), (-y1, x0), (-x1, -y1), (y0, -x1))[k % 4]
         # np.rot90 turns the first axis towards the second: x towards y, counter-clockwise.
-        return self._replace(
-            np.rot90(self.heights, k), known=np.rot90(self.known, k), origin=origin
-        )
-
-    def _replace(self, heights: np.ndarray, *, known: np.ndarray, origin=None) -> Self:
-        return type(self)(
-            heights, resolution=self.resolution, origin=origin or self.origin, known=known
-        )
+        heights, known = np.rot90(self.heights, k), np.rot90(self.known, k)
+        return replace(self, heights=heights, known=known, origin=origin)
 
     def save(self, path: str | Path) -> None:
         """Write the map to .npz, .tif / .tiff (GeoTIFF) or .png (16 bit, with `path`.yaml).

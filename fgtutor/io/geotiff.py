@@ -29,16 +29,18 @@ if TYPE_CHECKING:
 
     from fgtutor.elevation import ElevationMap
 
-_FOOT, _SURVEY_FOOT = 0.3048, 1200 / 3937
 _METRES = {
-    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
-    **dict.fromkeys(("km", "kilometre", "kilometer"), 1e3),
-    **dict.fromkeys(("dm", "decimetre", "decimeter"), 0.1),
-    **dict.fromkeys(("cm", "centimetre", "centimeter", "centimetres", "centimeters"), 0.01),
-    **dict.fromkeys(("mm", "millimetre", "millimeter", "millimetres", "millimeters"), 1e-3),
-    **dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), _FOOT),
-    **dict.fromkeys(("us survey foot", "us survey feet", "ftus", "us-ft", "sft"), _SURVEY_FOOT),
-    "foot_us": _SURVEY_FOOT,
+    name: metres
+    for metres, names in (
+        (1.0, "m, metre, metres, meter, meters"),
+        (1e3, "km, kilometre, kilometer"),
+        (0.1, "dm, decimetre, decimeter"),
+        (0.01, "cm, centimetre, centimeter, centimetres, centimeters"),
+        (1e-3, "mm, millimetre, millimeter, millimetres, millimeters"),
+        (0.3048, "ft, foot, feet, international foot, international feet"),
+        (1200 / 3937, "us survey foot, us survey feet, ftus, us-ft, sft, foot_us"),
+    )
+    for name in names.split(", ")
 }
 """What a raster may say in place of metres: the names of EPSG, PROJ, UCUM and everyday use."""
 
@@ -115,8 +117,6 @@ def _quiet() -> Iterator[None]:
 
 def _bands(file: "DatasetReader") -> tuple[int, list[int]]:
     """Return the band of heights and those that say where it is transparent."""
-    from rasterio.enums import ColorInterp
-
     if file.subdatasets:
         raise MapError(f"it holds {len(file.subdatasets)} rasters: save one of them alone")
     colours = file.colorinterp
@@ -128,9 +128,9 @@ def _bands(file: "DatasetReader") -> tuple[int, list[int]]:
             f"a map of heights has one band, this raster has {file.count} ({names}): save the band "
             "of heights alone, for example with gdal_translate -b 1"
         )
-    band = bands[0]
+    (band,) = bands
     kind, colour = file.dtypes[band - 1], colours[band - 1]
-    if colour not in (ColorInterp.gray, ColorInterp.undefined):
+    if colour.name not in ("gray", "undefined"):
         raise MapError(f"its band is part of a picture ({colour.name}), not heights")
     if np.dtype(kind).kind not in "fiu":
         raise MapError(f"heights are real numbers, this raster holds {kind}")

@@ -154,20 +154,16 @@ def _points(stream: BinaryIO, header: _Header) -> tuple[np.ndarray, tuple[int, i
         }
     )
     points = np.empty((header.count, 3))
-    kept = noise = withheld = 0
-    while raw := stream.read(min(_BLOCK, header.count - kept - noise - withheld) * header.size):
+    kept, left = 0, np.zeros(2, dtype=int)
+    while raw := stream.read(min(_BLOCK, header.count - kept - left.sum()) * header.size):
         table = np.frombuffer(raw, layout, len(raw) // header.size)
-        gone = table["flags"] & (4 if late else 128) != 0
-        bad = np.isin(table["class"] if late else table["class"] & 31, _NOISE) & ~gone
-        good = ~(gone | bad)
-        block = table["place"][good] * header.scales + header.offsets
+        withheld = table["flags"] & (4 if late else 128) != 0
+        noise = np.isin(table["class"] if late else table["class"] & 31, _NOISE) & ~withheld
+        block = table["place"][~(withheld | noise)] * header.scales + header.offsets
         points[kept : kept + len(block)] = block
-        kept, noise, withheld = (
-            kept + len(block),
-            noise + int(bad.sum()),
-            withheld + int(gone.sum()),
-        )
-    return points[:kept], (noise, withheld)
+        kept += len(block)
+        left += noise.sum(), withheld.sum()
+    return points[:kept], (int(left[0]), int(left[1]))
 
 
 def _unpacked(file: BinaryIO, header: _Header, size: int) -> tuple[np.ndarray, tuple[int, int]]:
