@@ -20,10 +20,10 @@ from fgtutor.errors import (
     TerrainError,
 )
 from fgtutor.evaluation import sweep
+from fgtutor.evaluation.cost import Cost
 from fgtutor.evaluation.sweep import (
     A1SweepConfig,
     SweepConfig,
-    TrainingCost,
     config_of,
     estimate,
     make_tasks,
@@ -31,7 +31,6 @@ from fgtutor.evaluation.sweep import (
     trainings,
 )
 from fgtutor.evaluation.tasks import run_tasks
-from fgtutor.evaluation.trials import Trial
 from fgtutor.learning import training
 from fgtutor.learning.config import A1TrainConfig, TrainConfig
 from fgtutor.specialist import load_specialist
@@ -74,8 +73,8 @@ def test_the_robot_decides_the_sizes():
     assert config_of(["--seeds", "1"])().train == TrainConfig()
     assert A1SweepConfig().robot == "a1"
     # One that has no sizes of its own takes the toy's, as `fgtutor train` does.
-    (work, *_) = trainings(SweepConfig(robot="a1"))
-    assert work.config == TrainConfig(robot="a1", seed=1, out=work.config.out)
+    (_, train), *_ = trainings(SweepConfig(robot="a1")).values()
+    assert train == TrainConfig(robot="a1", seed=1, out=train.out)
 
 
 @pytest.mark.parametrize("words", [["--train.terrain", "steps"], ["--train.seed=1"]])
@@ -87,24 +86,24 @@ def test_what_the_sweep_sets_is_refused_even_as_the_default(words, capsys):
 def test_it_starts_from_where_a_training_would_write_by_default(config, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     start = TrainConfig(start_from=Path("runs/toy-steps-seed1/specialist"))
-    (work, _) = trainings(replace(config, train=start))
-    assert work.config.start_from == tmp_path / "runs/toy-steps-seed1/specialist"
+    (_, train) = trainings(replace(config, train=start))["steps-1"]
+    assert train.start_from == tmp_path / "runs/toy-steps-seed1/specialist"
 
 
 def test_every_terrain_value_and_seed_is_a_training(config, tmp_path):
     config = replace(
         config, terrains=("steps", "gaps"), vary=("learning-rate", "1e-3", "5e-4"), seeds=(3, 4)
     )
-    everyone = trainings(config)
-    assert [each.name for each in everyone] == [
+    works = trainings(config)
+    assert list(works) == [
         f"{terrain}-learning-rate-{value}-{seed}"
         for terrain in ("steps", "gaps")
         for value in ("1e-3", "5e-4")
         for seed in (3, 4)
     ]
-    last = everyone[-1].config
+    name, (value, last) = works.popitem()
     assert (last.terrain, last.learning_rate, last.seed) == ("gaps", 5e-4, 4)
-    assert last.folder == config.folder / "runs" / everyone[-1].name
+    assert value == "5e-4" and last.folder == config.folder / "runs" / name
     rest = ("terrain", "seed", "out", "learning_rate")
     theirs, mine = asdict(last), asdict(TINY)
     assert {k: v for k, v in theirs.items() if k not in rest} == {
@@ -113,19 +112,23 @@ def test_every_terrain_value_and_seed_is_a_training(config, tmp_path):
 
 
 def test_values_of_several_words_and_paths(config):
-    (first, second) = trainings(replace(config, seeds=(1,), vary=("hidden", "8 4", "16")))
-    assert first.config.hidden == (8, 4) and second.config.hidden == (16,)
-    assert first.name == "steps-hidden-8_4-1"
+    works = trainings(replace(config, seeds=(1,), vary=("hidden", "8 4", "16")))
+    assert {name: train.hidden for name, (_, train) in works.items()} == {
+        "steps-hidden-8_4-1": (8, 4),
+        "steps-hidden-16-1": (16,),
+    }
+    actors = trainings(replace(config, seeds=(1,), vary=("actor", "perceptive", "dreamwaq")))
+    assert [train.actor for _, train in actors.values()] == ["perceptive", "dreamwaq"]
 
 
 def test_by_default_the_robots_own_terrains(config):
-    names = [each.name for each in trainings(replace(config, terrains=(), seeds=(1,)))]
-    assert names == ["steps-1", "gaps-1", "slopes-1", "rubble-1"]
+    names = trainings(replace(config, terrains=(), seeds=(1,)))
+    assert list(names) == ["steps-1", "gaps-1", "slopes-1", "rubble-1"]
 
 
 def test_a_task_takes_the_cores_and_the_gpu_of_its_training(config):
     def takes(config):
-        return [(task.cores, task.gpus) for task in make_tasks(trainings(config), 1)]
+        return [(task.cores, task.gpus) for task in make_tasks(config)]
 
     assert takes(config) == [(1, 0)] * 2
     large = replace(TINY, threads=4, device="cuda:0")
@@ -160,8 +163,8 @@ def test_settings_that_cannot_work_are_refused(config, changes, message):
     ("changes", "error", "message"),
     [
         ({"vary": ("gamma", "0.9", "0.9")}, ConfigError, "asked twice"),
-        ({"vary": ("speed", "1")}, ConfigError, "--speed 1 .*Unrecognized.*fgtutor train --help"),
-        ({"vary": ("gamma", "much")}, ConfigError, "--gamma much .*could not convert string to"),
+        ({"vary": ("speed", "1")}, ConfigError, "cannot vary speed: `fgtutor train --help`"),
+        ({"vary": ("gamma", "much")}, ConfigError, "--gamma much: .* valid number"),
         (
             {"vary": ("iterations", "0")},
             ConfigError,
@@ -180,9 +183,8 @@ def test_a_mistake_is_told_before_anything_trains(config, changes, error, messag
 
 
 def rows_of(terrain, setting, seed, outcomes, **more):
-    trial = asdict(Trial(terrain=terrain, policy=terrain, ground=1, seed=1, outcome="fell"))
     known = {"trained_on": terrain, "setting": setting, "training_seed": seed, "samples": 1000}
-    return [known | more | trial | {"outcome": outcome} for outcome in outcomes]
+    return [known | more | {"terrain": terrain, "outcome": outcome} for outcome in outcomes]
 
 
 def test_table_by_hand():
@@ -200,16 +202,6 @@ def test_table_by_hand():
     ]
 
 
-def test_cost_by_hand():
-    cost = TrainingCost(trainings=5, samples=5_000_000, seconds=5 * 3600)
-    assert (
-        cost.on(1)
-        == "5 trainings with 5,000,000 samples, at least about 5.0 h on 1 core like this one"
-    )
-    # Five trainings of an hour each take two cores three hours, and eight cores one.
-    assert "about 3.0 h on 2 cores" in cost.on(2) and "about 1.0 h on 8 cores" in cost.on(8)
-
-
 def test_a_value_that_fits_no_training_is_told_before_any(config):
     config = replace(config, vary=("steps", "8", "1"))
     with pytest.raises(ConfigError, match="rollouts of 1 steps never see half"):
@@ -218,7 +210,7 @@ def test_a_value_that_fits_no_training_is_told_before_any(config):
 
 
 def test_a_folder_that_cannot_be_written_is_told_at_once(config, monkeypatch):
-    monkeypatch.setattr(sweep, "estimate", lambda works: pytest.fail("this takes a while"))
+    monkeypatch.setattr(sweep, "estimate", lambda config: pytest.fail("this takes a while"))
     config.folder.write_text("in the way")
     with pytest.raises(StorageError, match=r"cannot write .*/sweep: "):
         sweep.run(config)
@@ -226,9 +218,9 @@ def test_a_folder_that_cannot_be_written_is_told_at_once(config, monkeypatch):
 
 @pytest.mark.slow
 def test_cost_is_measured(config):
-    cost = estimate(trainings(replace(config, vary=("iterations", "4", "6"))))
-    assert (cost.trainings, cost.samples) == (4, 2 * (4 + 6) * 4 * 8)
-    assert 0 < cost.seconds < 60
+    cost = estimate(replace(config, vary=("iterations", "4", "6")))
+    assert cost.work == f"4 trainings with {2 * (4 + 6) * 4 * 8} samples, at least"
+    assert cost.parts == 4 and cost.seconds > 0
     assert not config.folder.exists()  # nothing of it is kept
 
 
@@ -268,18 +260,18 @@ import os, signal
 from fgtutor.evaluation import sweep
 from fgtutor.learning.training import Trainer
 
-def killed_once(work, trials):
-    if not work.config.folder.exists():
+def killed_once(name, value, config, trials):
+    if not config.folder.exists():
         iterate = Trainer.iterate
 
         def dying(trainer):
             if trainer.iteration == 3:  # after the checkpoint of iteration 2
-                (work.config.folder / "died").touch()
+                (config.folder / "died").touch()
                 os.kill(os.getpid(), signal.SIGKILL)
             return iterate(trainer)
 
         Trainer.iterate = dying
-    return sweep.run_task(work, trials)
+    return sweep.run_task(name, value, config, trials)
 """
 
 
@@ -316,8 +308,8 @@ def test_interrupted_and_gone_on_is_the_same(whole, config, monkeypatch):
         return iterate(trainer)
 
     # Its iterations would be interrupted first.
-    cost = TrainingCost(trainings=2, samples=384, seconds=1.0)
-    monkeypatch.setattr(sweep, "estimate", lambda works: cost)
+    cost = Cost(work="2 trainings", seconds=1.0)
+    monkeypatch.setattr(sweep, "estimate", lambda config: cost)
     monkeypatch.setattr(training.Trainer, "iterate", asked_to_stop)
     # A process that a shell has put into the background ignores Ctrl-C, and these tests may be one.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -357,15 +349,15 @@ def test_more_seeds_and_values_in_the_same_folder_train_only_the_new(config, mon
 @pytest.mark.slow
 def test_a_generalist_crosses_every_kind(config):
     config = replace(config, terrains=("general",), seeds=(1,), trials=5)
-    ((_, result),) = run_tasks(make_tasks(trainings(config), config.trials), workers=1)
+    ((_, result),) = run_tasks(make_tasks(config), workers=1)
     assert [row["terrain"] for row in result.rows] == ["steps", "gaps", "slopes", "rubble", "steps"]
     assert {row["policy"] for row in result.rows} == {"general"}
 
 
 @pytest.mark.slow
 def test_a_training_that_cannot_go_on_is_named(config):
-    (work, _) = trainings(config)
-    training.train(replace(work.config, gamma=0.5, iterations=2), attended=False)
+    (value, train) = trainings(config)["steps-1"]
+    training.train(replace(train, gamma=0.5, iterations=2), attended=False)
     with pytest.raises(EvaluationError, match=r"training steps-1: .*gamma was 0.5") as caught:
-        sweep.run_task(work, 1)
+        sweep.run_task("steps-1", value, train, 1)
     assert isinstance(caught.value.__cause__, CheckpointError)

@@ -1,6 +1,6 @@
 """Measuring what was built: success rates with intervals, one module per experiment.
 
-An experiment (`matrix`, `ablation`, `sweep`) is a list of tasks (`runner`), whose rows are kept as
+An experiment (`matrix`, `ablation`, `sweep`) is a list of tasks (`tasks`), whose rows are kept as
 they finish (`shards`) and end in a folder with a table (`report`). `report` says how to add
 another.
 """

@@ -1,64 +1,54 @@
-"""What an evaluation will take, before it starts: a small sample, measured here and now.
+"""What an evaluation will take, told before it starts: a small sample, measured here and now.
 
-Reads a zoo and one terrain of each kind; gives numbers of maps and episodes, and hours. What
-another kind of run takes, such as trainings (`sweep`), is an `Estimate` too.
+Reads a zoo and one terrain of each kind; gives numbers of maps and episodes, and the time.
 """
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
 
 from fgtutor.evaluation.trials import EPISODES
 from fgtutor.execution import FollowConfig, execute_batch
+from fgtutor.io.progress import duration
 from fgtutor.planning import plan
 from fgtutor.specialist import Specialist
 from fgtutor.tensorization import assess_all
 from fgtutor.world.terrain import Terrain
 
 
-class Estimate(Protocol):
-    """What a run will take."""
-
-    def on(self, cores: int) -> str:
-        """Say it, for a number of cores."""
-        ...
-
-
-def on_cores(seconds: float, cores: int) -> str:
-    """Say what `seconds` of one core come to on a number of them."""
-    hours = seconds / cores / 3600
-    time = f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min"
-    return f"about {time} on {cores} core{'s' * (cores > 1)} like this one"
-
-
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """What an evaluation takes if every trial has a route and none fails early."""
+    """What an evaluation takes."""
 
-    maps: int
-    """Maps to assess, one a ground and policy of the zoo."""
-    episodes: int
-    """Episodes to drive."""
+    work: str
+    """What there is to do."""
     seconds: float
     """Time on one core, s."""
+    parts: int | None = None
+    """Equal parts of it, if one cannot be spread over several cores."""
 
     def on(self, cores: int) -> str:
         """Say it, for a number of cores."""
-        return (
-            f"{self.maps:,} maps to assess and up to {self.episodes:,} episodes, at most "
-            f"{on_cores(self.seconds, cores)}"
-        )
+        rounds = math.ceil(self.parts / cores) / self.parts if self.parts else 1 / cores
+        many = "1 core" if cores == 1 else f"{cores} cores"
+        return f"{self.work} about {duration(self.seconds * rounds)} on {many} like this one"
 
 
 def estimate(
-    zoo: Mapping[str, Specialist], terrains: Sequence[Terrain], *, grounds: int, episodes: int
+    zoo: Mapping[str, Specialist],
+    terrains: Sequence[Terrain],
+    *,
+    grounds: int,
+    episodes: int,
+    detour: float = 1.0,
 ) -> Cost:
     """Measure one map and one second of driving, and work out what `grounds` and `episodes` of
-    each terrain will take."""
+    each terrain take if every trial has a route, `detour` times the straight line, and drives it
+    to the end."""
     name, specialist = next(iter(zoo.items()))
     sample, at_once = terrains[0], min(episodes, EPISODES)
     threads = torch.get_num_threads()
@@ -86,9 +76,9 @@ def estimate(
     drive_seconds = (driven - assessed) / at_once
     cells = sum(terrain.elevation.heights.size for terrain in terrains)
     metres = sum(float(np.hypot(*np.subtract(t.goal, t.start))) for t in terrains)
+    driving = episodes * metres * detour / specialist.command[0] * drive_seconds
     return Cost(
-        maps=grounds * len(zoo) * len(terrains),
-        episodes=episodes * len(terrains),
-        seconds=grounds * cells * cell_seconds
-        + episodes * metres / specialist.command[0] * drive_seconds,
+        work=f"{grounds * len(zoo) * len(terrains):,} maps to assess and up to "
+        f"{episodes * len(terrains):,} episodes, at most",
+        seconds=grounds * cells * cell_seconds + driving,
     )

@@ -1,42 +1,41 @@
 """Many trainings side by side: terrains, seeds and the values of one setting, compared.
 
-Reads a training's settings and what to vary; trains a specialist each, drives it over held-out
-terrain with its own plan, and gives a row a crossing. A training is a task of the runner, so cores,
-a Ray cluster or machines with a part each share them. Its run folder lies in the report folder;
-a worker that is killed in it costs the time since the last checkpoint, and not a bit of the result.
+Reads a training's settings and what to vary; trains a specialist for each combination, drives it
+over held-out terrain with its own plan, and gives a row per crossing. A training is a task, so
+cores or a Ray cluster share them. Its run folder lies in the report folder; a worker that is killed
+costs the time since the training's last checkpoint, and not a bit of the result.
 """
 
-import contextlib
-import io
-import math
 import re
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, Any
+from typing import Annotated, Any, get_origin, get_type_hints
 
 import numpy as np
 from annotated_types import Interval, MinLen
+from pydantic import TypeAdapter, ValidationError
 from tqdm import tqdm
 
 from fgtutor.baselines import single
 from fgtutor.errors import ConfigError, EvaluationError, FgtutorError, SpecialistError
 from fgtutor.evaluation import calibration, report
 from fgtutor.evaluation.calibration import CalibrationConfig
-from fgtutor.evaluation.cost import on_cores
+from fgtutor.evaluation.cost import Cost
 from fgtutor.evaluation.report import Findings, markdown
 from fgtutor.evaluation.shards import RunConfig, digest, settings_of
-from fgtutor.evaluation.success import TrialsConfig, by_cell, cut, make_ground
+from fgtutor.evaluation.success import TrialsConfig, cut, make_ground
 from fgtutor.evaluation.tasks import Row, Task
-from fgtutor.evaluation.trials import drive
+from fgtutor.evaluation.trials import by_cell, drive
 from fgtutor.figures.charts import draw_shares
 from fgtutor.io.machine import usable_cores
 from fgtutor.io.storage import make_folder
-from fgtutor.io.validation import Seed, Unique, parse_options
+from fgtutor.io.validation import Seed, Unique
 from fgtutor.learning import training
 from fgtutor.learning.config import A1TrainConfig, TrainConfig, comparable, training_world
 from fgtutor.learning.trainer import CHECKPOINT, Trainer, give_back_memory
@@ -48,8 +47,10 @@ from fgtutor.statistics import calibration as compare
 COMMAND, RUNS = "sweep", "runs"
 """Its name, and where in the report folder the run folders lie."""
 WATCH_SECONDS = 10.0
-"""How often to look how far they are, s."""
-OURS_TO_SET = {
+"""How often the progress bar looks into the run folders, s."""
+CELL = ("trained_on", "setting", "training_seed")
+"""What tells the crossings of one training from those of another."""
+SET_BY_SWEEP = {
     "robot": "--robot",
     "terrain": "--terrains",
     "seed": "--seeds",
@@ -65,9 +66,8 @@ class SweepConfig(RunConfig):
     """Train a specialist for every terrain, seed and value of a setting, and compare them."""
 
     out: Path | None = Path("runs/sweep")
-    """Report folder, with a run folder a training in `runs`. The same command goes on from there;
-    with more terrains, seeds or values only the new ones are trained, and with other `trials`
-    none."""
+    """Report folder; each training has its run folder in `runs`. The same command goes on from
+    there: more terrains, seeds or values train only the new ones, other `trials` train none."""
     robot: str = "toy"
     """Which robot."""
     terrains: Annotated[tuple[str, ...], Unique] = ()
@@ -86,18 +86,23 @@ class SweepConfig(RunConfig):
         super().__post_init__()
         if self.out is None:
             raise ConfigError("trainings keep their checkpoints in a folder: give --out FOLDER")
-        untouched = type(self.train)()
-        for name in OURS_TO_SET:
-            given = getattr(self.train, name)
-            if given != getattr(untouched, name) and (name, given) != ("robot", self.robot):
-                raise _set_elsewhere(name)
+        shared, default = self.train, type(self.train)()
+        if shared.robot == self.robot:
+            shared = replace(shared, robot=default.robot)
+        for name in SET_BY_SWEEP:
+            if getattr(shared, name) != getattr(default, name):
+                raise _set_by_sweep(name)
         if len(self.vary) == 1:
-            raise ConfigError(f"nothing to vary {self.vary[0]} by: give its values too")
-        name = self.vary[0].replace("-", "_") if self.vary else ""
-        if name in OURS_TO_SET:
-            raise _set_elsewhere(name)
-        if name in ("from", "start_from"):
+            raise ConfigError(f"nothing to vary {self.option} by: give its values too")
+        if self.option in SET_BY_SWEEP:
+            raise _set_by_sweep(self.option)
+        if self.option in ("from", "start-from", "start_from"):
             raise ConfigError("all trainings of a sweep start alike: a sweep for each --train.from")
+
+    @property
+    def option(self) -> str:
+        """The option of `fgtutor train` that is varied, or nothing."""
+        return self.vary[0] if self.vary else ""
 
     @property
     def folder(self) -> Path:
@@ -107,7 +112,7 @@ class SweepConfig(RunConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class A1SweepConfig(SweepConfig):
-    """The same with the A1's sizes: about an hour of one core a training."""
+    """The same with the A1's sizes: about an hour of one core per training."""
 
     robot: str = "a1"
     train: TrainConfig = field(default_factory=A1TrainConfig)
@@ -116,33 +121,21 @@ class A1SweepConfig(SweepConfig):
 def config_of(words: Sequence[str]) -> type[SweepConfig]:
     """Return the config class for command line `words`, which may hold `--robot NAME`.
 
-    Raises `ConfigError` if they set what the sweep itself sets, were it to the default.
+    Raises `ConfigError` if they set what the sweep itself sets, even to the default.
     """
     for word in words:
         name = word.partition("=")[0].removeprefix("--train.").replace("-", "_")
-        if word.startswith("--train.") and name in OURS_TO_SET:
-            raise _set_elsewhere(name)
+        if word.startswith("--train.") and name in SET_BY_SWEEP:
+            raise _set_by_sweep(name)
     return A1SweepConfig if training.config_of(words) is A1TrainConfig else SweepConfig
 
 
-def _set_elsewhere(name: str) -> ConfigError:
-    return ConfigError(f"a sweep sets {name} of its trainings: use {OURS_TO_SET[name]}")
+def _set_by_sweep(name: str) -> ConfigError:
+    return ConfigError(f"a sweep sets {name} of its trainings: use {SET_BY_SWEEP[name]}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Training:
-    """One training of a sweep."""
-
-    name: str
-    """Unlike any other's; it names the run folder."""
-    setting: str
-    """The value of what is varied, or nothing."""
-    config: TrainConfig
-    """All its settings."""
-
-
-def trainings(config: SweepConfig) -> list[Training]:
-    """Return the trainings of a sweep, in the table's order.
+def trainings(config: SweepConfig) -> dict[str, tuple[str, TrainConfig]]:
+    """Return each training's varied value and settings by its name, in the table's order.
 
     Raises `ConfigError` if a value does not fit, or two trainings would be the same.
     """
@@ -151,176 +144,142 @@ def trainings(config: SweepConfig) -> list[Training]:
     shared = replace(config.train, robot=config.robot, start_from=start and start.resolve())
     for terrain in terrains:  # as does an unknown terrain
         training_world(replace(shared, terrain=terrain, rows=1, columns=1))
-    option, *values = config.vary or ("", "")
+    option, values = config.option, config.vary[1:] or ("",)
     varied = {value: _with(shared, option, value) if option else shared for value in values}
-    everyone = []
+    found = {}
     for terrain, value, seed in product(terrains, values, config.seeds):
         setting = f"{option}-{re.sub(r'[^A-Za-z0-9.+-]', '_', value)}" if option else ""
         name = "-".join(filter(None, (terrain, setting, str(seed))))
+        if name in found:
+            raise ConfigError(f"asked twice for {name}: give each value once")
         own = replace(varied[value], terrain=terrain, seed=seed, out=config.folder / RUNS / name)
-        everyone.append(Training(name=name, setting=value, config=own))
-    names = [each.name for each in everyone]
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise ConfigError(f"asked twice for {', '.join(sorted(twice))}: give each value once")
-    return everyone
+        found[name] = value, own
+    return found
 
 
 def _with(config: TrainConfig, option: str, value: str) -> TrainConfig:
-    """Return the settings with one of them read from the command line's words for it."""
-    words, said = [f"--{option}", *value.split()], io.StringIO()
+    """Return the settings with one of them as the command line's words give it."""
+    name = option.replace("-", "_")
+    kind = get_type_hints(type(config)).get(name)
+    if kind is None:
+        raise ConfigError(f"cannot vary {option}: `fgtutor train --help` says what can be set")
+    words = value.split() if get_origin(kind) is tuple else value
     try:
-        with contextlib.redirect_stderr(said):
-            return parse_options(type(config), words, "fgtutor train", config)
-    except SystemExit as error:
-        lines = (line.strip("│ ") for line in said.getvalue().splitlines() if "│" in line)
-        why = next(lines, "there is no such option")
+        read = TypeAdapter(kind).validate_python(words)
+    except ValidationError as error:
         raise ConfigError(
-            f"cannot train with {' '.join(words)} ({why}): `fgtutor train --help` says what can be"
-        ) from error
+            f"cannot train with --{option} {value}: {error.errors()[0]['msg']}"
+        ) from None
+    return replace(config, **{name: read})
 
 
-def run_task(work: Training, trials: int) -> list[Row]:
-    """Do one task: train, or go on where a worker was lost, then cross held-out terrain."""
-    resume = (work.config.folder / CHECKPOINT).exists()
-    try:
-        training.train(replace(work.config, resume=resume), attended=False)
-        # As a zoo would: on the CPU, wherever it was trained.
-        return _crossings(work, load_specialist(work.config.folder / "specialist"), trials)
-    except FgtutorError as error:
-        raise EvaluationError(
-            f"training {work.name}: {error} (the others are kept: correct this, or leave it out, "
-            "and run again)"
-        ) from error
-
-
-def _crossings(work: Training, specialist: Specialist, trials: int) -> list[Row]:
-    """Return a row a crossing of held-out terrain, as `fgtutor evaluate matrix` would drive it."""
-    config = work.config
-    kinds = ROBOTS[config.robot].scale.mixed if config.terrain == GENERAL else (config.terrain,)
-    known = {
-        "training": work.name,
-        "trained_on": config.terrain,
-        "setting": work.setting,
-        "training_seed": config.seed,
-        "samples": specialist.provenance["samples"],
-        **_tracking(specialist, kinds, trials),
-    }
-    crossings = TrialsConfig(robot=config.robot, trials=trials)
-    rows = []
-    for indices in cut(trials):
-        grounds = [make_ground(crossings, kinds[i % len(kinds)], i) for i in indices]
-        planned = {specialist.name: partial(single, specialist.name)}
-        driven = drive(grounds, planned, {specialist.name: specialist}, settings=crossings.planning)
-        rows += [known | asdict(trial) for trial in driven]
-    return rows
-
-
-def _tracking(specialist: Specialist, kinds: Sequence[str], envs: int) -> dict[str, float]:
-    """Return the mean r_v on held-out terrain, and how far its prediction is from it."""
-    config = CalibrationConfig(robot=specialist.robot, envs=envs)
-    drives = [calibration.drive(specialist, kind, config) for kind in kinds]
-    measured = np.concatenate([drive.measured for drive in drives])
-    _, error = compare(np.concatenate([drive.predicted for drive in drives]), measured)
-    return {"r_v": round(float(measured.mean()), 4), "calibration_error": round(error, 4)}
-
-
-def make_tasks(works: Sequence[Training], trials: int) -> list[Task]:
-    """Return a task a training, with the cores and the GPU that it takes."""
+def make_tasks(config: SweepConfig) -> list[Task]:
+    """Return a task per training, with the cores and the GPU that it takes."""
     return [
         Task(
-            name=f"{each.name}-crossed-{trials}",
+            name=f"{name}-crossed-{config.trials}",
             function=run_task,
-            arguments=(each, trials),
-            cores=each.config.threads,
-            gpus=int(each.config.device.startswith("cuda")),
+            arguments=(name, value, train, config.trials),
+            cores=train.threads,
+            gpus=int(train.device.startswith("cuda")),
         )
-        for each in works
+        for name, (value, train) in trainings(config).items()
     ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrainingCost:
-    """What the trainings take, if all stay as fast as they begin."""
-
-    trainings: int
-    samples: int
-    """Of all trainings."""
-    seconds: float
-    """Of all trainings one after the other, s."""
-
-    def on(self, cores: int) -> str:
-        """Say it, for a number of trainings at a time."""
-        rounds = math.ceil(self.trainings / cores)
-        return (
-            f"{self.trainings} training{'s' * (self.trainings > 1)} with {self.samples:,} samples, "
-            f"at least {on_cores(self.seconds / self.trainings * rounds * cores, cores)}"
-        )
+def run_task(name: str, value: str, config: TrainConfig, trials: int) -> list[Row]:
+    """Do one task: train, or go on where a worker was lost, then cross held-out terrain."""
+    resume = (config.folder / CHECKPOINT).exists()
+    try:
+        training.train(replace(config, resume=resume), attended=False)
+        # As a zoo would: on the CPU, wherever it was trained.
+        specialist = load_specialist(config.folder / "specialist")
+        known = {"training": name, "trained_on": config.terrain, "setting": value}
+        known |= {"training_seed": config.seed, "samples": specialist.provenance["samples"]}
+        return _crossings(specialist, config, trials, known)
+    except FgtutorError as error:
+        raise EvaluationError(
+            f"training {name}: {error} (the others are kept: correct this, or leave it out, and "
+            "run again)"
+        ) from error
 
 
-def estimate(works: Sequence[Training]) -> TrainingCost:
+def _crossings(specialist: Specialist, config: TrainConfig, trials: int, known: Row) -> list[Row]:
+    """Return a row per crossing of held-out terrain, driven as by `fgtutor evaluate matrix`."""
+    robot, terrain = config.robot, config.terrain
+    kinds = ROBOTS[robot].scale.mixed if terrain == GENERAL else (terrain,)
+    free = CalibrationConfig(robot=robot, envs=trials)
+    drives = [calibration.drive(specialist, kind, free) for kind in kinds]
+    measured = np.concatenate([drive.measured for drive in drives])
+    _, error = compare(np.concatenate([drive.predicted for drive in drives]), measured)
+    known |= {"r_v": round(float(measured.mean()), 4), "calibration_error": round(error, 4)}
+    crossings = TrialsConfig(robot=robot, trials=trials)
+    planned = {specialist.name: partial(single, specialist.name)}
+    rows = []
+    for indices in cut(trials):
+        grounds = [make_ground(crossings, kinds[i % len(kinds)], i) for i in indices]
+        driven = drive(grounds, planned, {specialist.name: specialist}, settings=crossings.planning)
+        rows += [known | trial.row for trial in driven]
+    return rows
+
+
+def estimate(config: SweepConfig) -> Cost:
     """Measure the second iteration of a training for each value, and work out what all take.
 
     That is done on the CPU, here: a cluster's GPU may be elsewhere. Raises what a training would if
     a value does not fit the others, before hours have gone into them.
     """
+    works = trainings(config).values()
     samples, seconds = 0, 0.0
-    for setting in dict.fromkeys(each.setting for each in works):
-        same = [each.config for each in works if each.setting == setting]
+    for value in dict(works):
+        same = [train for own, train in works if own == value]
         trainer = Trainer(replace(same[0], device="cpu"))
         first, second = (trainer.iterate()["seconds"] for _ in range(2))
         del trainer  # this process only waits from here on, and a world of A1s is large
         give_back_memory()
-        size = same[0].num_envs * same[0].steps
-        samples += len(same) * same[0].iterations * size
-        seconds += len(same) * same[0].iterations * (second - first)
-    return TrainingCost(trainings=len(works), samples=samples, seconds=seconds)
-
-
-def _groups(rows: Sequence[Row]) -> Iterator[tuple[tuple[str, str], dict[int, list[Row]]]]:
-    """Give for every terrain and value the crossings by seed, in the order of the trainings."""
-    for group, crossings in by_cell(rows, ("trained_on", "setting")).items():
-        seeds = by_cell(crossings, ("training_seed",))
-        yield group, {seed: same for (seed,), same in seeds.items()}
+        iterations = len(same) * same[0].iterations
+        samples += iterations * same[0].num_envs * same[0].steps
+        seconds += iterations * (second - first)
+    many = "1 training" if len(works) == 1 else f"{len(works)} trainings"
+    return Cost(
+        work=f"{many} with {samples:,} samples, at least", seconds=seconds, parts=len(works)
+    )
 
 
 def table(rows: Sequence[Row], option: str = "") -> str:
-    """Return the crossings as a Markdown table: a line a terrain and value, a column a seed."""
-    lines, seeds = [], list(dict.fromkeys(row["training_seed"] for row in rows))
-    for (terrain, setting), by_seed in _groups(rows):
-        shares = [Share.reached(by_seed[seed]) for seed in seeds]
-        firsts = [by_seed[seed][0] for seed in seeds]
-        lines.append(
-            [
-                terrain,
-                *([setting] if option else []),
-                f"{firsts[0]['samples']:,}",
-                *shares,
-                f"{100 * fmean(share.successes / share.trials for share in shares):.1f}",
-                f"{fmean(first['r_v'] for first in firsts):.3f}",
-                f"{fmean(first['calibration_error'] for first in firsts):.3f}",
-            ]
-        )
-    varied, names = ([option] if option else []), (f"seed {seed}" for seed in seeds)
-    return markdown(
-        ["terrain", *varied, "samples", *names, "mean", "r_v", "calibration error"], lines
-    )
+    """Return the crossings as Markdown: a line per terrain and value, a column per seed."""
+    cells = by_cell(rows, CELL)
+    seeds = list(dict.fromkeys(seed for _, _, seed in cells))
+    lines = []
+    for terrain, value in dict.fromkeys((terrain, value) for terrain, value, _ in cells):
+        own = [cells[terrain, value, seed] for seed in seeds]
+        shares = [Share.reached(crossings) for crossings in own]
+        mean = fmean(share.successes / share.trials for share in shares)
+        r_v = fmean(crossings[0]["r_v"] for crossings in own)
+        error = fmean(crossings[0]["calibration_error"] for crossings in own)
+        line = [
+            f"{own[0][0]['samples']:,}",
+            *shares,
+            f"{100 * mean:.1f}",
+            f"{r_v:.3f}",
+            f"{error:.3f}",
+        ]
+        lines.append([terrain, value, *line] if option else [terrain, *line])
+    names = ["samples", *(f"seed {seed}" for seed in seeds), "mean", "r_v", "calibration error"]
+    return markdown(["terrain", option, *names] if option else ["terrain", *names], lines)
 
 
 def run(config: SweepConfig) -> int:
     """Train from the command line, print the table and write the report."""
-    option = config.vary[0] if config.vary else ""
-    # A training's own threads are cores that no other one has.
-    workers = config.workers or max(1, usable_cores() // config.train.threads)
+    option, tasks, settings = config.option, make_tasks(config), _settings(config)
     title = f"Trainings side by side ({config.robot})"
     iterations = "" if option == "iterations" else f", {config.train.iterations} iterations"
 
     def find(rows: list[Row]) -> Findings:
-        groups = {
-            " ".join(filter(None, (terrain, option, setting))): {
-                f"seed {seed}": Share.reached(crossings) for seed, crossings in by_seed.items()
-            }
-            for (terrain, setting), by_seed in _groups(rows)
-        }
+        groups: dict[str, dict[str, Share]] = {}
+        for (terrain, setting, seed), crossings in by_cell(rows, CELL).items():
+            group = " ".join(filter(None, (terrain, option, setting)))
+            groups.setdefault(group, {})[f"seed {seed}"] = Share.reached(crossings)
         chart = draw_shares(groups, title=title)
         return Findings(
             table=table(rows, option),
@@ -330,36 +289,32 @@ def run(config: SweepConfig) -> int:
             figures={"success.svg": chart.savefig},
         )
 
-    works = trainings(config)
-    settings = _settings(config)
     make_folder(config.folder)
     print(f"the curves, while they train: tensorboard --logdir {config.folder / RUNS}")
     return report.run_and_report(
-        replace(config, workers=workers),
+        # A training's own threads are cores that no other one has.
+        replace(config, workers=config.workers or max(1, usable_cores() // config.train.threads)),
         title=title,
-        tasks=make_tasks(works, config.trials),
+        tasks=tasks,
         settings=settings,
-        cost=partial(estimate, works),
+        cost=partial(estimate, config),
         find=find,
-        watched=_watched([work.config for work in works]),
+        watched=_progress([train for _, train in trainings(config).values()]),
     )
 
 
-@contextlib.contextmanager
-def _watched(runs: Sequence[TrainConfig]) -> Iterator[None]:
+@contextmanager
+def _progress(runs: Sequence[TrainConfig]) -> Iterator[None]:
     """Show how far the trainings are, wherever they run, by the snapshots in their run folders."""
-    over = threading.Event()
+    over, total = threading.Event(), sum(run.iterations for run in runs)
 
     def watch() -> None:
-        ended = over.wait(WATCH_SECONDS)
-        if ended:  # nothing was left to train
+        if over.wait(WATCH_SECONDS):  # nothing was left to train
             return
-        total, done = sum(run.iterations for run in runs), _iterations(runs)
-        with tqdm(total=total, initial=done, unit="it", desc="trained") as bar:
-            while not ended:
-                ended = over.wait(WATCH_SECONDS)
-                bar.n = _iterations(runs)
-                bar.refresh()
+        with tqdm(total=total, initial=_iterations(runs), unit="it", desc="trained") as bar:
+            while not over.wait(WATCH_SECONDS):
+                bar.update(_iterations(runs) - bar.n)
+            bar.update(_iterations(runs) - bar.n)
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
@@ -377,23 +332,23 @@ def _iterations(runs: Sequence[TrainConfig]) -> int:
 
 
 def _settings(config: SweepConfig) -> dict[str, Any]:
-    """Return what a training's crossings depend on, but for what tells the trainings apart."""
-    start, shared = config.train.start_from, comparable(config.train)
+    """Return what a training's crossings depend on, but for what tells the trainings apart.
+
+    Raises `SpecialistError` if there is nothing where they are to start from.
+    """
+    shared, start, told = comparable(config.train), config.train.start_from, None
     for name in ("robot", "terrain", "seed", "start_from"):
         del shared[name]
+    if start:
+        files = [start / name for name in (CHECKPOINT, DESCRIPTION) if (start / name).is_file()]
+        if not files:
+            raise SpecialistError(f"{start} holds no specialist to start from: give another folder")
+        told = digest(files[0].read_bytes())
     return settings_of(
         config,
         COMMAND,
         without=("terrains", "seeds", "vary", "trials", "train"),
         vary=config.vary[:1],
-        start=_digest(start) if start else None,
+        start=told,
         **{f"train.{name}": value for name, value in shared.items()},
     )
-
-
-def _digest(start: Path) -> str:
-    """Return a digest of the policy to start from; raises `SpecialistError` if there is none."""
-    files = [start / name for name in (CHECKPOINT, DESCRIPTION) if (start / name).is_file()]
-    if not files:
-        raise SpecialistError(f"{start} holds no specialist to start from: give another folder")
-    return digest(files[0].read_bytes())
