@@ -30,7 +30,7 @@ settings.register_profile("house", deadline=None, max_examples=25)
 settings.load_profile("house")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_specialist() -> Callable[..., Specialist]:
     """Return a maker of real, untrained specialists: `make_specialist(name, seed=0, **fields)`."""
 
@@ -71,7 +71,7 @@ def make_specialist() -> Callable[..., Specialist]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_rolling(make_specialist) -> Callable[..., Specialist]:
     """Return a maker of toys that only roll: a policy of zero weights leaves the legs alone.
 

@@ -12,9 +12,9 @@ from PIL import Image
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, RenderingError
 from fgtutor.execution import Episode
-from fgtutor.figures import videos
+from fgtutor.figures import toy_film, videos
 from fgtutor.figures.a1_film import ABOVE, BESIDE, DISTANCE, TITLE, VIEW, A1Film, steepness
-from fgtutor.figures.canvas import POLICY_COLOURS
+from fgtutor.figures.style import POLICY_COLOURS
 from fgtutor.robots.a1.model import STANCE, STANCE_HEIGHT
 from fgtutor.robots.offscreen import Renderer
 from fgtutor.routes import Route
@@ -118,6 +118,7 @@ def test_the_camera_turns_with_the_robot_the_short_way(episode, terrain, route):
     assert film.azimuths.max() < np.degrees(3.5) + BESIDE + 1
 
 
+@pytest.mark.slow
 def test_a_frame_shows_robot_words_and_map(episode, terrain, route, graphics):
     film = A1Film(episode, terrain, route)
     early, late, last = film.frames([30, 70, 99])
@@ -145,6 +146,7 @@ def test_the_video_lasts_as_long_as_the_walk(episode, terrain, route, graphics, 
     assert strip.size == (2 * 426 + 6, 2 * 266 + 6)
 
 
+@pytest.mark.slow
 def test_without_graphics_nothing_is_left(episode, terrain, route, monkeypatch, tmp_path):
     monkeypatch.setenv("MUJOCO_GL", "off")
     with pytest.raises(RenderingError, match="fgtutor doctor"):
@@ -160,4 +162,4 @@ def test_the_robot_decides_which_film_it_is(episode, terrain, route, change):
     else:
         assert type(videos.film_of(episode, terrain, route)) is A1Film
         toy = replace(episode, robot="toy", body=episode.body[:, :9])
-        assert type(videos.film_of(toy, terrain, route)) is videos.Film
+        assert type(videos.film_of(toy, terrain, route)) is toy_film.ToyFilm

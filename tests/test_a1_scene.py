@@ -123,6 +123,7 @@ def test_the_goal_stands_at_the_lines_end_on_the_ground():
     np.testing.assert_allclose(disc[:4], (*spot, z, 0.2), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_height_field_has_its_colours_in_the_right_places():
     """Draw a hill on the left of a pit, seen along +x from above."""
     x, y = np.mgrid[0:80, 0:80] * 0.05

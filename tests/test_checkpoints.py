@@ -11,13 +11,22 @@ from fgtutor.learning.config import TrainConfig
 from fgtutor.learning.trainer import Trainer
 
 
-@pytest.fixture
-def trainer(tmp_path):
-    """A training that has saved its first iteration."""
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A training that has saved its first iteration, and the bytes it saved."""
     sizes = {"num_envs": 2, "steps": 8, "rows": 1, "columns": 1, "hidden": (4,)}
-    trainer = Trainer(TrainConfig(out=tmp_path, label_seconds=0.12, iterations=2, **sizes))
+    out = tmp_path_factory.mktemp("training")
+    trainer = Trainer(TrainConfig(out=out, label_seconds=0.12, iterations=2, **sizes))
     trainer.iterate()
     trainer.save()
+    return trainer, trainer.checkpoint.read_bytes()
+
+
+@pytest.fixture
+def trainer(trained):
+    """The same training, its checkpoint as it was saved."""
+    trainer, saved = trained
+    trainer.checkpoint.write_bytes(saved)
     return trainer
 
 

@@ -178,6 +178,7 @@ def test_drawing_runs_no_code_of_the_current_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.slow
 def test_a_pipe_that_nobody_reads_is_no_error(tmp_path):
     read, write = os.pipe()
     os.close(read)

@@ -336,6 +336,7 @@ def test_training_gives_a_blind_specialist_with_a_critic_that_sees(tmp_path):
     assert critic.obs_groups == ["critic"]
 
 
+@pytest.mark.slow
 def test_the_ppo_loss_never_reaches_the_encoder(tmp_path):
     trainer = Trainer(tiny(tmp_path))
     trainer.algorithm.context_updates = 0

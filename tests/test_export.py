@@ -161,6 +161,7 @@ def test_a_policy_for_other_observations_is_refused(make_specialist, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_network_that_answers_otherwise_is_an_error(make_specialist):
     policy = make_specialist().policy
     model = export.to_onnx(policy)
@@ -200,6 +201,7 @@ class Reading(MLPModel):
         return Graph()
 
 
+@pytest.mark.slow
 def test_a_network_that_onnx_cannot_express_is_named():
     groups = TensorDict({"policy": torch.zeros(1, 6)}, batch_size=[1])
     policy = Reading(groups, {"actor": ["policy"]}, "actor", 3, [8])

@@ -57,6 +57,7 @@ def test_a_newcomer_of_a_name_that_the_zoo_has_is_refused(config, make_rolling, 
         run(replace(config, newcomer=str(folder)))
 
 
+@pytest.mark.slow
 def test_the_report_tells_before_from_after(config, capsys):
     assert run(config) == 0
     printed = capsys.readouterr().out
@@ -80,6 +81,7 @@ def test_the_report_tells_before_from_after(config, capsys):
     assert json.loads((config.out / "run.json").read_text())["settings"]["newcomer"] == "steps"
 
 
+@pytest.mark.slow
 def test_a_tensor_that_changes_is_an_error(config):
     rows = run_task(replace(config, out=None), "flat", ("without", "with"), [0])
     assert "1 maps (1 pairs" in compare_tensors(rows, "steps")

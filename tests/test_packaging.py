@@ -79,7 +79,9 @@ def test_what_is_declared_is_used(extra):
         "exercises",
         "exercises --check",
         "grade solutions/ex06.ipynb",
-        "sweep --robot toy --terrains steps --out sweep --ray local",
+        pytest.param(
+            "sweep --robot toy --terrains steps --out sweep --ray local", marks=pytest.mark.slow
+        ),
         "evaluate matrix --robot toy --trials 1 --ray local",
     ],
 )

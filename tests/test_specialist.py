@@ -138,6 +138,7 @@ def test_a_truncated_file_is_named(make_specialist, tmp_path, file, keep):
         load_specialist(folder)
 
 
+@pytest.mark.slow
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 @given(file=st.sampled_from(FILES), place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_a_flipped_bit_is_found(make_specialist, tmp_path_factory, file, place, bit):
