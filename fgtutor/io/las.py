@@ -1,8 +1,8 @@
-"""Point clouds in LAS and LAZ files: what is ground to stand on, in metres.
+"""Point clouds in LAS and LAZ files, in metres, without noise and withheld points.
 
-Reads .las and .laz; gives coordinates without noise and withheld points. LAZ is decompressed by
-lazrs, in a process of its own. Source: ASPRS, LAS 1.4 R15; the units are those of the file's
-projection records, which are GeoTIFF's keys (OGC 19-008) or WKT (OGC 12-063r5).
+Reads .las and .laz; gives coordinates. LAZ is decompressed by lazrs, in a process of its own.
+Source: ASPRS, LAS 1.4 R15; the units are those of the file's projection records, which are
+GeoTIFF's keys (OGC 19-008) or WKT (OGC 12-063r5).
 """
 
 import struct

@@ -1,7 +1,7 @@
-"""Decompresses the points of a LAZ file, in a process of its own that may die of them.
+"""Decompress the points of a LAZ file in a process of its own: some damaged files abort lazrs.
 
-Run by path, without fgtutor and without site packages, so that it starts in no time: reads the file
-on its standard input, writes point records to its standard output. Its arguments are the folder of
+Run by path, without fgtutor and without site packages, so that it starts at once: reads the file on
+its standard input, writes point records to its standard output. Its arguments are the folder of
 lazrs, where the points begin, how many there are, their size, the LASzip record in hexadecimal
 digits, and how many bytes of memory and seconds it may take.
 """

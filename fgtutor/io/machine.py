@@ -1,4 +1,4 @@
-"""What the machine lets this process use, where a container or a batch system gives it less.
+"""Cores and memory that this process may use, also within a container or a batch job.
 
 Reads the scheduler's affinity, free memory, and the limits of Linux's control groups, versions 1
 and 2; gives a number of cores and of bytes. Sources: sched_getaffinity(2); the kernel's cgroup-v2

@@ -1,7 +1,7 @@
-"""How far something is: a bar on the terminal once it lasts, after a line that says how long.
+"""Progress on the terminal: a bar for work that lasts, after an estimate of its duration.
 
-Reads the parts of a piece of work as they are done; writes to stderr, and nothing about what takes
-under two seconds.
+Reads the parts of the work as they are done; writes to stderr, and nothing about work of less than
+two seconds.
 """
 
 import sys
@@ -52,7 +52,7 @@ def waiting(what: str) -> Iterator[threading.Timer]:
 
 
 def duration(seconds: float) -> str:
-    """Return a time that nobody needs to the second: "40 s", "12 min", "3.5 h"."""
+    """Return a duration, rounded for reading: "40 s", "12 min", "3.5 h"."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,4 +1,4 @@
-"""Pictures of heights: their rows to a map's columns and back.
+"""Rasters of heights: the rows of an image to a map's columns and back.
 
 Images run row by row from north to south, maps [ix, iy] from south to north; only this file turns
 one into the other.

@@ -1,4 +1,4 @@
-"""Reading files that may be missing, damaged or made to do harm: one error, which names the file.
+"""Reading files that may be missing, damaged or malicious: every failure is one error of ours.
 
 Gives a file to the reader for its suffix, and the arrays of .npz files, which are checked before
 memory is taken for them and never unpickled.

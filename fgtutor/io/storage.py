@@ -119,7 +119,7 @@ def beside(path: Path, suffix: str = "") -> Path:
 
 
 def _key(path: Path) -> str:
-    """Return eight digits for the file's name on this computer, whose processes we can ask for."""
+    """Return eight digits for a file's name on this computer: only its processes are known here."""
     return f"{zlib.crc32(os.fsencode(f'{platform.node()}/{path.name}')):08x}"
 
 
@@ -163,8 +163,8 @@ def make_folder(path: str | Path) -> None:
 def locked_folder(path: str | Path) -> Iterator[None]:
     """Make a folder if there is none, and keep other processes out of it for a block.
 
-    The system takes the lock back when the process ends, however it ends. A file system without
-    locks keeps nobody out.
+    The system takes the lock back when the process ends, however it ends. On a file system that
+    has no locks, nothing is locked.
 
     Raises:
         StorageError: Another process works in the folder, or the system refuses to write there.

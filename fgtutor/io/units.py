@@ -1,6 +1,6 @@
-"""What a coordinate is in metres, by the reference system that a file names.
+"""The units of a file's coordinates, by the reference system that it names.
 
-Reads WKT, EPSG numbers and GeoTIFF keys; gives a factor for x and y, and one for z if it is told.
+Reads WKT, EPSG numbers and GeoTIFF keys; gives the metres in a unit of x and y, and of z if told.
 Sources: OGC 12-063r5 (WKT), OGC 19-008 (GeoTIFF keys), EPSG's units of measure.
 """
 

@@ -82,10 +82,9 @@ _FINITE = ConfigDict(strict=True, allow_inf_nan=False)
 def check_fields(config: Any, error: type[FgtutorError] = ConfigError) -> None:
     """Raise `error` unless every number and choice of a dataclass is what its type allows.
 
-    A dataclass calls this in `__post_init__`, so that its values are checked whoever builds it.
+    A dataclass calls this in `__post_init__`, so that its values are checked however it is built.
     """
-    kind = type(config)
-    _check(kind, {name: getattr(config, name) for name in _numeric_fields(kind)}, error)
+    check_arguments(type(config), vars(config), error)
 
 
 def check_arguments(
@@ -95,13 +94,9 @@ def check_arguments(
 
     A function calls this first, with itself and `locals()`.
     """
-    _check(function, given, error)
-
-
-def _check(kind: Callable[..., Any], values: Mapping[str, Any], error: type[FgtutorError]) -> None:
-    for name, adapter in _numeric_fields(kind).items():
+    for name, adapter in _numeric_fields(function).items():
         try:
-            adapter.validate_python(_plain(values[name]))
+            adapter.validate_python(_plain(given[name]))
         except ValidationError as problem:
             raise error(f"{name}: {_first(problem)}") from None
 
@@ -142,7 +137,7 @@ def parse_options(kind: type[T], words: Sequence[str], program: str, default: T 
     Raises what `kind` itself does for a value that it refuses. Words that are no options, or no
     numbers, end the program with a message, as `--help` does.
     """
-    import tyro  # here, since most who check values read no command line
+    import tyro  # here: only command lines need it
 
     said = io.StringIO()
     options: dict[str, Any] = {} if default is None else {"default": default}

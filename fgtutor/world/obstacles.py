@@ -1,4 +1,4 @@
-"""The obstacles that terrains are made of, and how large they are for each robot.
+"""The obstacles that terrains are made of, and the sizes that they may have.
 
 Reads a `TerrainScale`, a difficulty and an rng; gives boxes laid over the full width of a corridor.
 Kinds: the paper's steps, gaps, bridge and valley (Sec. IV-A), and slopes, stairs and rubble.

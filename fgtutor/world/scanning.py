@@ -27,7 +27,7 @@ Area = tuple[float, float, float, float]
 VOXEL = 0.05
 """Side of a voxel, m (paper); a cell is divided into whole voxels as near to it as possible."""
 _EMPTY = 1000
-"""A map of more than a million cells is refused if it has more cells a point than this, for the
+"""A map of more than a million cells is refused if it has more cells per point than this, for the
 same reason that `MOST_CELLS` is."""
 WALL = 0.2
 """Points of a cell that are spread over more than this lie on a wall too, m. No step is so high,

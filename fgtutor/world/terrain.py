@@ -177,7 +177,7 @@ def make_terrain(
         x = x1
         sections.append(Section(name=kind, x0=x0, y0=0.0, x1=x1, y1=width))
         if kind == name or name == "mixed":
-            # Straight before and after the obstacle: nobody should step onto a beam at an angle.
+            # Straight before and after the obstacle: a robot must not step onto a beam at an angle.
             lane += [(x0 - 0.3, y), (x1 + 0.3, y)]
     length = course.snap(x + apron if name == "mixed" else scale.length)
     course.full(x, length)
