@@ -15,7 +15,7 @@ import torch
 
 from fgtutor.cli.demo import GOAL, MAP, START
 from fgtutor.course.widgets.explorer import Explorer
-from fgtutor.course.widgets.tau_views import TauView
+from fgtutor.course.widgets.tau_pictures import TauPictures
 from fgtutor.elevation import ElevationMap
 from fgtutor.specialist import load_zoo
 from fgtutor.tensorization import Assessment
@@ -41,22 +41,22 @@ def real_world() -> Explorer:
 
 def noisy_world() -> Explorer:
     """Return the worst case: policies that take turns at every cell, so little can be left out."""
-    dice = torch.Generator().manual_seed(0)
+    rng = torch.Generator().manual_seed(0)
     shape = (CELLS, CELLS, 8)
+    grid = ElevationMap(np.zeros((CELLS, CELLS)))
     said = {
         f"policy {i}": Assessment(
-            0.3 + 0.7 * torch.rand(shape, generator=dice), 2 * torch.rand(shape, generator=dice)
+            0.3 + 0.7 * torch.rand(shape, generator=rng), 2 * torch.rand(shape, generator=rng), grid
         )
         for i in range(POLICIES)
     }
-    grid = ElevationMap(np.zeros((CELLS, CELLS)))
     return Explorer(grid, said, grid.centre_of(5, 5), grid.centre_of(122, 122))
 
 
 def drag(explorer: Explorer, count: int, **settings: float) -> str:
     """Move tau_high through its range and say what that took."""
     explorer.update(**settings)
-    view = TauView(explorer)
+    view = TauPictures(explorer)
     cpu, wall = [], []
 
     def timed(work: Callable[[], object]) -> None:
@@ -83,7 +83,7 @@ def main() -> None:
     print("map     switch cost   CPU p50      p95 wall p50      p95   p95 of CPU in budget")
     for name, make in (("demo", real_world), ("noise", noisy_world)):
         explorer = make()
-        for switch_cost in (0.0, 0.5, 3.0):
+        for switch_cost in (0.0, 1.0, 3.0):
             row = drag(explorer, count, switch_cost=switch_cost)
             print(f"{name:6}{switch_cost:13.1f} {row}", flush=True)
 

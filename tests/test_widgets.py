@@ -1,4 +1,4 @@
-"""The widgets in Python: what a browser would send, what it would get, and the PNG without one."""
+"""The widgets in Python: what a browser would send, and what it would get."""
 
 import io
 import subprocess
@@ -11,8 +11,9 @@ import torch
 from PIL import Image
 
 from fgtutor.course.widgets.explorer import Explorer
-from fgtutor.course.widgets.tau_views import TauView
+from fgtutor.course.widgets.tau_pictures import TauPictures
 from fgtutor.elevation import ElevationMap
+from fgtutor.settings import SETTINGS
 from fgtutor.tensorization import Assessment
 from fgtutor.world.terrain import make_terrain
 
@@ -21,21 +22,22 @@ START, GOAL = (0.25, 0.25), (4.25, 3.25)
 
 
 @pytest.fixture
-def said() -> dict[str, Assessment]:
-    """What three specialists say of the map below."""
+def grid() -> ElevationMap:
+    return ElevationMap(np.zeros((9, 7)), resolution=0.5)
+
+
+@pytest.fixture
+def said(grid) -> dict[str, Assessment]:
+    """What three specialists say of the map."""
     rng = np.random.default_rng(9)
     return {
         name: Assessment(
             torch.tensor(rng.uniform(0, 1, (9, 7, 8)), dtype=torch.float32),
             torch.tensor(rng.gamma(1.0, 1.0, (9, 7, 8)), dtype=torch.float32),
+            grid,
         )
         for name in NAMES
     }
-
-
-@pytest.fixture
-def grid() -> ElevationMap:
-    return ElevationMap(np.zeros((9, 7)), resolution=0.5)
 
 
 @pytest.fixture
@@ -43,9 +45,9 @@ def widgets():
     """The module of the widgets, which needs the lab extra."""
     pytest.importorskip("ipywidgets", reason="the lab extra is not installed: make test does")
     pytest.importorskip("anywidget", reason="the lab extra is not installed: make test does")
-    from fgtutor.course.widgets import views
+    from fgtutor.course.widgets import jupyter
 
-    return views
+    return jupyter
 
 
 def say(board, **content) -> None:
@@ -62,25 +64,37 @@ def test_a_drag_redraws_and_the_text_follows(widgets, grid, said):
     assert board.view.frame == before[1] + 1
     assert board.view.pictures["M"] == before[0]["M"]
     assert board.view.pictures["w gaps"] != before[0]["w gaps"]
-    assert board.view.pictures["P"] == TauView(alone).scene().pictures["P"].tobytes()
+    assert board.view.pictures["P"] == TauPictures(alone).scene().pictures["P"].tobytes()
     board.policies["steps"].value = False
     board.f_min.value, board.switch_cost.value = 0.05, 1.5
-    assert board.explorer.settings == replace(
-        alone.settings, policies=NAMES[1:], f_min=0.05, switch_cost=1.5
-    )
+    assert board.explorer.settings == replace(alone.settings, f_min=0.05, switch_cost=1.5)
+    assert board.explorer.policies == NAMES[1:]
+    board.taus.value = (1.0, 1.0)  # where the ends meet, w_ood is nearly a step
+    loss = said["gaps"].reconstruction
+    clear = (loss - 1).abs() > 0.01
+    assert torch.equal(board.explorer.weights["gaps"][clear], (loss < 1)[clear].float())
+
+
+@pytest.mark.parametrize(("name", "settings"), SETTINGS.items())
+def test_a_button_chooses_ours_or_the_papers(widgets, grid, said, name, settings):
+    board = widgets.TauExplorer(grid, said, START, GOAL, taus=(0.3, 0.4), f_min=0.2, switch_cost=9)
+    board.named[name].click()
+    alone = Explorer(grid, said, START, GOAL, settings)
+    assert board.explorer.settings == settings and board.view.status == alone.status
+    assert board.switch_cost.value == settings.switch_cost
 
 
 def test_clicks_arrows_and_hovering_reach_the_explorer(widgets, grid, said):
     board = widgets.TauExplorer(grid, said, START, GOAL)
     say(board, kind="press", cells=[[2, 5]], shift=False)
-    assert board.explorer.settings.goal == grid.centre_of(2, 5)
+    assert board.explorer.goal == grid.centre_of(2, 5)
     say(board, kind="drag", cells=[[3, 5], [4, 6]], shift=False)
-    assert board.explorer.settings.goal == grid.centre_of(4, 6)
+    assert board.explorer.goal == grid.centre_of(4, 6)
     say(board, kind="press", cells=[[1, 1]], shift=True)
-    assert board.explorer.settings.start == grid.centre_of(1, 1)
+    assert board.explorer.start == grid.centre_of(1, 1)
     board.picks.value = "start"
     say(board, kind="move", step=[1, -9], shift=False)
-    assert board.explorer.settings.start == grid.centre_of(2, 0)  # it stays on the map
+    assert board.explorer.start == grid.centre_of(2, 0)  # it stays on the map
     say(board, kind="hover", cells=[[4, 4]])
     assert board.view.reading == board.explorer.read((4, 4))
     before = board.view.reading
@@ -122,32 +136,16 @@ def test_a_drive_plays_pauses_and_resets(widgets, make_rolling):
 
 
 @pytest.mark.slow
-def test_without_anywidget_there_is_a_png(widgets):
-    code = (
-        "import sys; sys.modules['anywidget'] = None\n"
-        "import numpy as np, torch\n"
-        "from fgtutor.elevation import ElevationMap\n"
-        "from fgtutor.tensorization import Assessment\n"
-        "from fgtutor.course.widgets.views import TauExplorer\n"
-        "f = torch.zeros(4, 3, 8); f[..., 0] = 1\n"
-        "said = Assessment(f, torch.full((4, 3, 8), 0.5))\n"
-        "M = ElevationMap(np.zeros((4, 3)))\n"
-        "board = TauExplorer(M, {'steps': said}, (.05, .05), (.35, .05))\n"
-        "first = board.view.image.value\n"
-        "board.taus.value = (0.1, 0.9)\n"
-        "print(first[:4] == b'\\x89PNG', board.view.image.value != first)\n"
-        "print(board.view.status.value)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    # w_ood = (0.9 - 0.5) / 0.8 = 0.5, and three steps cost 2 each.
-    assert done.stdout.splitlines() == [
-        "True True",
-        "tau 0.10 to 0.90: cost 6.00, 0.30 m, policy switches: 0 (steps 0.3 m)",
-    ]
+def test_without_the_lab_extra_the_message_says_how_to_install_it():
+    code = "import sys; sys.modules['anywidget'] = None; import fgtutor.course.widgets.jupyter"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    said = done.stderr.splitlines()[-1]
+    assert said.startswith("fgtutor.errors.MissingExtraError: the widgets need the package anywid")
+    assert 'pip install -c constraints.txt -e ".[lab]"' in said
 
 
 def test_the_front_end_is_shipped_and_asks_no_network(widgets):
     for name in ("panels.js", "panels.css"):
         text = (widgets.STATIC / name).read_text(encoding="utf-8")
         assert "://" not in text and "import " not in text
-    assert "export default" in widgets.CanvasView._esm
+    assert "export default" in widgets.Canvas._esm

@@ -44,14 +44,14 @@ for i, name in enumerate(("steps", "gaps", "slopes", "rubble")):
     f = 0.6 + 0.35 * np.sin(x / 13 + i) * np.cos(y / 17 - i)
     loss = 1.8 + 1.7 * np.sin(x / 21 + 2 * i) * np.cos(y / 15 + i)
     said[name] = Assessment(
-        *(torch.tensor(np.repeat(a[..., None], 8, -1), dtype=torch.float32) for a in (f, loss))
+        *(torch.tensor(np.repeat(a[..., None], 8, -1), dtype=torch.float32) for a in (f, loss)), M
     )
 start, goal = (1.05, 6.45), (11.55, 6.05)
 """
 """Four policies on 128 x 128 cells: the size that a drag is promised to be quick for."""
 CELLS = (
     WORLD,
-    "from fgtutor.course.widgets.views import TauExplorer\n"
+    "from fgtutor.course.widgets.jupyter import TauExplorer\n"
     "TauExplorer(M, said, start, goal, taus=(0.1, 2.0), switch_cost=1.0)",
 )
 

@@ -89,7 +89,7 @@ print(
 )
 
 # %%
-from fgtutor.course.lessons import draw_windows
+from fgtutor.course.patch_pictures import draw_windows
 
 eastward, askew = (3.4, 2.0, 0.0), (5.6, 1.4, 0.9)  # x, y in metres; yaw in radians
 draw_windows(M, [eastward, askew], grid)
@@ -100,7 +100,7 @@ draw_windows(M, [eastward, askew], grid)
 # cells.
 
 # %%
-from fgtutor.course.lessons import patch_at, patch_gallery
+from fgtutor.course.patch_pictures import patch_at, patch_gallery
 
 patch_gallery(
     [patch_at(M, eastward, grid), patch_at(M, askew, grid)],
@@ -134,7 +134,7 @@ print(f"largest change: {difference.abs().max():.5f} m")
 # flat below, flat above.
 
 # %%
-from fgtutor.course.lessons import patch_rose
+from fgtutor.course.patch_pictures import patch_rose
 
 heights = np.zeros((40, 40))
 heights[20:] = 0.15  # from x = 2 m on the ground is 15 cm higher

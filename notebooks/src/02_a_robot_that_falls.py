@@ -65,7 +65,7 @@ print(f"after {12 * env.control_dt:.2f} s the nose points up by {env.state[0, 0,
 # wheels roll at the commanded speed. How far does it get over gaps?
 
 # %%
-from fgtutor.course.lessons import Scripted, straight_route
+from fgtutor.course.drives import Scripted, straight_route
 from fgtutor.execution import FollowConfig, execute
 from fgtutor.figures.videos import film_strip
 

@@ -33,7 +33,7 @@ tiles = [make_terrain("steps", difficulty=(i % 5 + 1) / 5, seed=2 * i) for i in 
 env = ToyEnv(World([tiles]), robots, seed=0)
 
 # %%
-from fgtutor.course.lessons import collect
+from fgtutor.course.drives import collect
 
 
 def roll(observations):
@@ -170,7 +170,7 @@ calibration_plot(*calibration(promised.numpy(), measured[valid].numpy()))
 # ## What does it fear?
 
 # %%
-from fgtutor.course.lessons import patch_gallery
+from fgtutor.course.patch_pictures import patch_gallery
 
 order = promised.argsort()
 seen = test["patch"][valid]
@@ -195,7 +195,7 @@ patch_gallery(seen[pick], env.grid, captions, title="Least and most feasible for
 import numpy as np
 
 from fgtutor import ElevationMap, load_zoo
-from fgtutor.course.lessons import patch_at
+from fgtutor.course.patch_pictures import patch_at
 
 steps = load_zoo("toy")["steps"]
 

@@ -55,7 +55,7 @@ draw_table(
 # Now let each of them drive each.
 
 # %%
-from fgtutor.course.lessons import straight_route
+from fgtutor.course.drives import straight_route
 from fgtutor.execution import FollowConfig, execute_batch
 
 patience = FollowConfig(patience=1.5, grace=2.0)
@@ -139,7 +139,7 @@ worlds = {name: rough(one.patch) for name, one in drives.items()}
 {name: len(patches) for name, patches in worlds.items()}
 
 # %%
-from fgtutor.course.lessons import patch_gallery
+from fgtutor.course.patch_pictures import patch_gallery
 
 grid = zoo["steps"].grid
 home, abroad = (worlds[name][:: len(worlds[name]) // 4][1:3] for name in ("steps", "gaps"))
@@ -290,7 +290,7 @@ draw_weight(opinions["steps"].ood(low, high), M, "steps")
 
 # %%
 from fgtutor.course.widgets.explorer import Explorer
-from fgtutor.course.widgets.tau_views import tau_figure
+from fgtutor.course.widgets.tau_pictures import tau_figure
 
 tau_figure(Explorer(M, opinions, START, GOAL))
 
@@ -299,7 +299,7 @@ tau_figure(Explorer(M, opinions, START, GOAL))
 # click on the map to set start and goal; hold the pointer over a cell to read its numbers.
 
 # %%
-from fgtutor.course.widgets.views import TauExplorer
+from fgtutor.course.widgets.jupyter import TauExplorer
 
 TauExplorer(M, opinions, START, GOAL)
 

@@ -34,7 +34,7 @@ draw_elevation(M)
 # %%
 import torch
 
-from fgtutor.course.lessons import patch_at
+from fgtutor.course.patch_pictures import patch_at
 
 steps = load_zoo("toy")["steps"]
 net, grid = steps.feasibility, steps.grid
@@ -90,7 +90,7 @@ draw_petals(f, M, every=1, axes=plateau.axes[0])
 # The other way to look at the same tensor is one map for each heading.
 
 # %%
-from fgtutor.course.lessons import heading_maps
+from fgtutor.course.patch_pictures import heading_maps
 
 heading_maps(f, M, label="f")
 
@@ -119,7 +119,7 @@ print(f"largest difference: {(turned - expected).abs().max():.1e}")
 # few units, laid out like a patch.
 
 # %%
-from fgtutor.course.lessons import patch_gallery
+from fgtutor.course.patch_pictures import patch_gallery
 
 first = net.head[0]
 weights = first.weight.detach()[:, : grid.num_points] * net.height_scale
@@ -232,7 +232,7 @@ print(f"steps closed since they leave known ground: {closed.sum():,} of {closed.
 # the stroke are asked again:
 
 # %%
-from fgtutor.course.widgets.views import TerrainPainter
+from fgtutor.course.widgets.jupyter import TerrainPainter
 
 TerrainPainter(M, steps)
 

@@ -133,7 +133,7 @@ print(f"cost, added up by hand: {cost:.3f}")
 print(f"cost, says networkx:    {networkx.dijkstra_path_length(graph, (0, 0), (5, 3)):.3f}")
 
 # %%
-from fgtutor.course.lessons import draw_graph
+from fgtutor.course.route_pictures import draw_graph
 
 draw_graph(graph, tiny, path, names)
 
@@ -204,7 +204,7 @@ for x, y in (M.centre_of(ix, shut), (5.7, 6.4)):
 # `PlanSettings()`; the paper's are `PAPER`. Everything in this package uses one of the two:
 
 # %%
-from fgtutor.course.lessons import compare_routes
+from fgtutor.course.route_pictures import compare_routes
 
 calm = plan(fused, policy_map, **task)
 compare_routes(M, {"the paper's settings": route, "ours: a switch costs 1": calm})

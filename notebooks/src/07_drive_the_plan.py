@@ -50,7 +50,7 @@ episode = execute(planned.route, terrain, zoo)
 episode
 
 # %%
-from fgtutor.course.lessons import draw_drive
+from fgtutor.course.route_pictures import draw_drive
 
 draw_drive(episode, planned.route, M)
 

@@ -37,7 +37,7 @@ for name in ("trunk", "FR_hip", "FR_thigh", "FR_calf"):
 # has no motor by what has.*
 
 # %%
-from fgtutor.course.a1_lessons import draw_postures
+from fgtutor.course.a1_pictures import draw_postures
 
 stance = model.key_qpos[0]
 spread = stance.copy()
@@ -174,7 +174,7 @@ place[:, :2] += trio.offsets[0, 0] - torch.tensor((0.0, 1.6))
 trio.start(torch.arange(3), place.expand(3, 3), steps.command[0])
 
 # %%
-from fgtutor.course.lessons import draw_windows, patch_gallery
+from fgtutor.course.patch_pictures import draw_windows, patch_gallery
 
 seen = trio.get_observations()
 x, y = (place[0, :2] - trio.offsets[0, 0]).tolist()
@@ -206,7 +206,7 @@ for _ in range(125):
     loads.append(trio.sensed[0, trio.sensors["foot_force"]].reshape(4, 3).norm(dim=-1))
 
 # %%
-from fgtutor.course.a1_lessons import draw_terms
+from fgtutor.course.a1_pictures import draw_terms
 
 who = ("walks", "stands", "flails")
 draw_terms({
@@ -226,7 +226,7 @@ draw_terms({
 # One term asks for a **gait**: feet in diagonal pairs, by a clock. Did it listen?
 
 # %%
-from fgtutor.course.a1_lessons import draw_gait
+from fgtutor.course.a1_pictures import draw_gait
 
 draw_gait(torch.stack(loads), trio.control_dt)
 
@@ -269,8 +269,8 @@ draw_postures({"as it walks": posture, "in the mirror": image})
 # Here is a drive by hand: straight on, a curve to the left, a curve to the right.
 
 # %%
-from fgtutor.course.a1_lessons import A1View, show_walk
-from fgtutor.course.lessons import straight_route
+from fgtutor.course.a1_pictures import A1View, show_walk
+from fgtutor.course.drives import straight_route
 from fgtutor.course.widgets.driving import Drive
 
 ground = make_terrain("steps", robot="a1", difficulty=0.3, seed=5)
@@ -288,7 +288,7 @@ show_walk(drive.episode, ground, straight_route(ground, "steps"))
 # reach further than the robot was trained for, so that you can feel where that ends.
 
 # %%
-from fgtutor.course.widgets.views import DriveA1
+from fgtutor.course.widgets.jupyter import DriveA1
 
 DriveA1(ground, zoo, render=A1View(ground))
 

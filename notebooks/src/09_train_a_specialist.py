@@ -236,8 +236,7 @@ exam = [make_terrain("steps", robot="a1", difficulty=0.65, seed=2 * i + 1) for i
 drivers = {"walker": load_specialist(walker), "mine": mine, "steps": steps}
 
 # %%
-from fgtutor.course.a1_lessons import drive_together
-from fgtutor.course.lessons import straight_route
+from fgtutor.course.drives import drive_together, straight_route
 from fgtutor.execution import FollowConfig
 
 jobs = [(straight_route(ground, name), ground, i) for name in drivers

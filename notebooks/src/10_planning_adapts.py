@@ -71,7 +71,7 @@ for way, gate in zip(WAYS, terrain.sections, strict=True):
     print(f"{way:6} way: up to {100 * top:.0f} cm, in two steps")
 
 # %%
-from fgtutor.figures.canvas import Picture
+from fgtutor.figures.style import Picture
 
 narrow = Picture(4.6, 6.4)
 draw_elevation(M, axes=narrow.subplots())
@@ -94,7 +94,7 @@ for name, (_, route) in plans.items():
 # %%
 from dataclasses import replace
 
-from fgtutor.course.lessons import compare_routes
+from fgtutor.course.route_pictures import compare_routes
 
 drawn = {name: "refused" for name in plans}
 drawn |= {name: replace(route, names=("steps",)) for name, route in routes.items()}
@@ -153,7 +153,7 @@ draw_curves(
 # A short route is a claim. Let them walk: each its own route, a few times, all side by side.
 
 # %%
-from fgtutor.course.a1_lessons import drive_together
+from fgtutor.course.drives import drive_together
 from fgtutor.course.notebooks import budget
 from fgtutor.execution import FollowConfig
 
@@ -192,7 +192,7 @@ for name, episodes in walked.items():
 # SPL has paid for it in full, however short the way was.
 
 # %%
-from fgtutor.course.lessons import draw_drive
+from fgtutor.course.route_pictures import draw_drive
 
 name = list(routes)[-1] if routes else ""
 best = max(walked[name], key=lambda walk: walk.length) if routes else None

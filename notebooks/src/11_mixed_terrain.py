@@ -36,7 +36,7 @@ def corridor(kind, seed):
 
 # %%
 from fgtutor.baselines import AssessedMap, find_route, ours
-from fgtutor.course.a1_lessons import daring_route
+from fgtutor.course.drives import daring_route
 from fgtutor.course.notebooks import budget
 
 for seed in range(1, 2 * budget(fast=2, full=8, unit="courses at most", each=2.0), 2):
@@ -67,7 +67,7 @@ for part in terrain.sections:
 # Four autoencoders look at one corridor.
 
 # %%
-from fgtutor.figures.canvas import Picture
+from fgtutor.figures.style import Picture
 from fgtutor.figures.maps import draw_weight
 
 sheet = Picture(7.2, 6.4)
@@ -144,7 +144,7 @@ episode = execute(route, terrain, team, config=follow)
 episode
 
 # %%
-from fgtutor.course.a1_lessons import show_walk
+from fgtutor.course.a1_pictures import show_walk
 
 show_walk(episode, terrain, route, count=9)
 
@@ -166,7 +166,7 @@ except RenderingError:
     print("no graphics library draws here: no film")
 
 # %%
-from fgtutor.course.lessons import draw_drive
+from fgtutor.course.route_pictures import draw_drive
 
 draw_drive(episode, route, M)
 
@@ -182,7 +182,7 @@ draw_drive(episode, route, M)
 from collections import Counter
 
 from fgtutor.baselines import planners
-from fgtutor.course.a1_lessons import drive_together
+from fgtutor.course.drives import drive_together
 
 contestants = [*zoo, "ours", *(["general"] if "general" in everyone else [])]
 ways = planners(everyone)

@@ -21,7 +21,7 @@
 # %%
 import numpy as np
 
-from fgtutor.figures.canvas import Picture
+from fgtutor.figures.style import Picture
 from fgtutor.robots.lidar import LidarConfig, pattern
 
 sensor, looks = LidarConfig(), Picture(7.2, 3.0)
@@ -36,7 +36,7 @@ looks
 # course of two terrains and look at it once, from where the robot stands.
 
 # %%
-from fgtutor.course.a1_lessons import draw_cloud
+from fgtutor.course.cloud_pictures import draw_cloud
 from fgtutor.evaluation.switching import lay_course
 from fgtutor.robots.lidar import carried, scan_terrain
 
@@ -104,7 +104,7 @@ draw_elevation(M)
 # In simulation, and only there, we know the truth. Subtract it.
 
 # %%
-from fgtutor.course.a1_lessons import difference
+from fgtutor.course.cloud_pictures import difference
 
 error = difference(M, truth)
 wrong = np.abs(error.heights[error.known])
@@ -151,7 +151,7 @@ for neighbours in (0, to_cells.neighbours):
 # %%
 from fgtutor import load_zoo
 from fgtutor.baselines import AssessedMap, find_route, ours
-from fgtutor.course.a1_lessons import daring_route
+from fgtutor.course.drives import daring_route
 
 zoo = load_zoo("a1")
 assessed, ends = AssessedMap(M, zoo), (terrain.start, terrain.goal)
@@ -168,7 +168,7 @@ def route_at(switch_cost):
 free, priced = route_at(0.0), route_at(1.0)
 
 # %%
-from fgtutor.course.lessons import compare_routes
+from fgtutor.course.route_pictures import compare_routes
 
 compare_routes(M, {"switching is free (the paper)": free, "a switch costs 1": priced})
 
@@ -180,7 +180,7 @@ compare_routes(M, {"switching is free (the paper)": free, "a switch costs 1": pr
 
 # %%
 from fgtutor import execute
-from fgtutor.course.a1_lessons import show_walk
+from fgtutor.course.a1_pictures import show_walk
 
 walk = execute(priced, terrain, {name: zoo[name] for name in priced.names})
 walk
@@ -231,7 +231,7 @@ draw_curves(
 # price, and a policy takes over only when it has been wanted for a few steps in a row).
 
 # %%
-from fgtutor.course.a1_lessons import drive_together
+from fgtutor.course.drives import drive_together
 from fgtutor.execution import FollowConfig
 
 trials = budget(fast=3, full=15, unit="walks a cell, four cells", each=4.0)
@@ -275,7 +275,7 @@ for name, ws in cells.items():
 # too low. If they lie at edges, it was the position.
 
 # %%
-from fgtutor.course.lessons import draw_drive
+from fgtutor.course.route_pictures import draw_drive
 
 manner, level = "careful", "off by inches"
 shown = min(cells[f"{manner}, {level}"], key=lambda w: (w.success, w.length))

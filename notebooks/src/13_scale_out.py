@@ -59,7 +59,7 @@ four, hired = ask(after)
 print(list(after), hired, sep="\n")
 
 # %%
-from fgtutor.course.lessons import compare_routes
+from fgtutor.course.route_pictures import compare_routes
 
 compare_routes(M, {"before": answer, "with the newcomer": hired})
 

@@ -11,14 +11,21 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fgtutor import directions, patches
-from fgtutor.course.widgets.scene import Panel, Scene, feasibility_picture, ground_picture
+from fgtutor.course.widgets.panels import (
+    Cell,
+    Panel,
+    Scene,
+    cell_table,
+    check_cell,
+    feasibility_picture,
+    ground_picture,
+)
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.figures.canvas import policy_colours
+from fgtutor.figures.style import policy_colours
 from fgtutor.specialist import Specialist
 from fgtutor.tensorization import Assessment, Taus, assess, resolve_taus
 
-Cell = tuple[int, int]
 Window = tuple[slice, slice]
 
 
@@ -71,8 +78,7 @@ class Painting:
         ix, iy = np.ogrid[:nx, :ny]
         heights = self.elevation.heights.copy()
         for cell in cells:
-            if not (0 <= cell[0] < nx and 0 <= cell[1] < ny):
-                raise ConfigError(f"there is no cell {cell} on a map of {nx} x {ny} cells")
+            check_cell(self.elevation, cell)
             away = np.hypot(ix - cell[0], iy - cell[1]) * self._resolution
             heights[away <= radius + 1e-9] = height
         self.elevation = self._map(heights)
@@ -137,21 +143,16 @@ class Painting:
 
     def read(self, cell: Cell) -> str:
         """Return a cell's numbers; raises `ConfigError` off the map."""
-        nx, ny = self.elevation.shape
-        if not (0 <= cell[0] < nx and 0 <= cell[1] < ny):
-            raise ConfigError(f"there is no cell {cell} on a map of {nx} x {ny} cells")
-        rows = [
-            f"cell {cell}   height {self.elevation.heights[cell]:.2f} m",
-            "heading" + "".join(f"{name:>8}" for name in directions.NAMES),
-        ]
-        for label, tensor in (
-            ("f", self.assessment.f),
-            ("L_recon", self.assessment.reconstruction),
-            ("w_ood", self.assessment.ood(*self.taus)),
-            ("F", self.assessment.weighted(*self.taus)),
-        ):
-            rows.append(f"{label:<7}" + "".join(f"{value:8.2f}" for value in tensor[cell].tolist()))
-        return "\n".join(rows)
+        check_cell(self.elevation, cell)
+        assessment, taus = self.assessment, self.taus
+        tensors = {
+            "f": assessment.f,
+            "L_recon": assessment.reconstruction,
+            "w_ood": assessment.ood(*taus),
+            "F": assessment.weighted(*taus),
+        }
+        rows = {label: tensor[cell].tolist() for label, tensor in tensors.items()}
+        return cell_table(self.elevation, cell, rows)
 
     def scene(self) -> Scene:
         """Draw M and F side by side, the window of the last stroke outlined."""

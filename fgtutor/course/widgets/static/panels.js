@@ -1,4 +1,4 @@
-// Draws a scene (fgtutor/course/widgets/scene.py) on canvases, and tells Python what a person does with it.
+// Draws a scene (fgtutor/course/widgets/panels.py) on canvases, and tells Python what a person does with it.
 //
 // Pictures come as RGB bytes, one pixel a cell, upright: row 0 is the largest y. Points of the
 // overlay count (right, down) in cells. Messages name cells as Python does: [ix, iy], y up.

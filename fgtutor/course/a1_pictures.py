@@ -1,13 +1,13 @@
-"""What the A1's half of the course draws and drives beside maps and routes (see `lessons`).
+"""Pictures of the A1: its postures and walks, its gait, and what its reward pays for.
 
-Reads states, forces, rewards, point clouds and routes; gives pictures, each of one object, and a
-few helpers that keep a lesson's cells short. MuJoCo draws the robot where a graphics library works;
-where none does, stick figures take its place, so that every lesson runs everywhere.
+Reads states, episodes, forces and rewards; gives figures and film strips. MuJoCo draws the robot
+where a graphics library works; where none does, stick figures take its place, so that every
+notebook runs everywhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -17,14 +17,10 @@ from numpy.typing import ArrayLike
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from fgtutor.baselines import View, find_route, without_ood
-from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, RenderingError
-from fgtutor.execution import Episode, FollowConfig, execute_batch
+from fgtutor.execution import Episode, FollowConfig
 from fgtutor.figures.a1_film import BESIDE, DISTANCE, VIEW
-from fgtutor.figures.canvas import TITLE, Panels, Picture
-from fgtutor.figures.charts import INK, LINES, colours_of
-from fgtutor.figures.maps import GROUND
+from fgtutor.figures.style import INK, LINES, TITLE, Panels, Picture, colours_of
 from fgtutor.figures.videos import film_strip
 from fgtutor.io.validation import Positive, check_arguments
 from fgtutor.robots.a1.looks import a1_scene
@@ -32,7 +28,6 @@ from fgtutor.robots.a1.model import CALF_LENGTH, HIP_OFFSET, LEG_X, LEG_Y, LEGS,
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.robots.offscreen import Renderer, Shot
 from fgtutor.routes import Route
-from fgtutor.specialist import Specialist
 from fgtutor.world.terrain import Terrain
 
 LEG_COLOURS = dict(zip(LEGS, LINES, strict=False))
@@ -41,10 +36,6 @@ LOADED = 10.0
 """A foot that the ground pushes with more than this stands, N."""
 STEEPNESS = 25.0
 """How far down the camera looks, degrees."""
-HARDLY = 1e-9
-"""As good as no lower limit on feasibility: f is a sigmoid, and never quite 0."""
-DOTS = 3_000
-"""Points of a cloud that are drawn at most: more would only cover each other."""
 PAGE = 840
 """Widest film strip, pixels: a notebook is no wider, and must stay small."""
 
@@ -85,7 +76,7 @@ def draw_postures(postures: Mapping[str, ArrayLike], *, title: str = "") -> Pict
         yaw = Rotation.from_quat(state[3:7], scalar_first=True).as_euler("ZYX")[0]
         ahead = Rotation.from_euler("z", -yaw)
         legs = ahead.apply((leg_points(state) - state[:3]).reshape(-1, 3)).reshape(4, 4, 3)
-        # Who stands before it and looks at its face has the robot's left, +y, on the right.
+        # Seen from the front, the robot's left, +y, is on the right.
         for row, axis in enumerate((0, 1)):
             axes = panels[row, column]
             _draw_legs(axes, legs[..., axis], legs[..., 2])
@@ -185,7 +176,7 @@ class A1View:
             self._renderer = None
 
 
-# What it feels and is paid for --------------------------------------------------------------------
+# Gait and reward ----------------------------------------------------------------------------------
 
 
 def draw_gait(loads: ArrayLike, dt: Positive) -> Picture:
@@ -206,7 +197,7 @@ def draw_gait(loads: ArrayLike, dt: Positive) -> Picture:
 
 
 def draw_terms(behaviours: Mapping[str, Mapping[str, float]]) -> Picture:
-    """Draw what each term of the reward pays for each behaviour, and the sum that is paid out."""
+    """Draw what each term of the reward gives for each behaviour, and their sum."""
     names = list(next(iter(behaviours.values())))
     figure = Picture(7.0, 0.9 + 0.42 * (len(names) + 1))
     axes = figure.subplots()
@@ -226,72 +217,3 @@ def draw_terms(behaviours: Mapping[str, Mapping[str, float]]) -> Picture:
     axes.legend(frameon=False, fontsize=9)
     axes.set_title("What it earns, term by term", **TITLE, loc="left")
     return figure
-
-
-# Routes and walks ---------------------------------------------------------------------------------
-
-
-def drive_together(
-    jobs: Sequence[tuple[Route, Terrain, int]],
-    zoo: Mapping[str, Specialist],
-    *,
-    config: FollowConfig | None = None,
-) -> list[Episode]:
-    """Drive (route, terrain, seed) side by side, whatever policies each route was planned with.
-
-    A batch costs hardly more than one walk. Each episode counts policies as its own route does.
-    Terrains must have one size. Raises `ConfigError` if a route names a policy that the zoo lacks.
-    """
-    routes, terrains, seeds = zip(*jobs, strict=True) if jobs else ((), (), ())
-    return execute_batch(routes, terrains, zoo, seeds=seeds, config=config)
-
-
-def daring_route(
-    view: View, start: tuple[float, float], goal: tuple[float, float], *, switch_cost: float = 1.0
-) -> Route:
-    """Return the best route if every f is believed wherever it is asked, however low it is.
-
-    Where ours refuses, this one goes: it shows whether the refusal was wise.
-    """
-    return find_route(without_ood, view, start, goal, f_min=HARDLY, switch_cost=switch_cost)
-
-
-# Clouds -------------------------------------------------------------------------------------------
-
-
-def draw_cloud(
-    points: Float[np.ndarray, "n 3"], *, sensors: ArrayLike | None = None, title: str = ""
-) -> Picture:
-    """Draw a point cloud from above and from the side, coloured by height; crosses are sensors."""
-    shown = np.asarray(points)[:: max(1, -(-len(points) // DOTS))]
-    x, y, z = shown.T
-    figure = Picture(7.2, 4.8)
-    above, side = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.2))
-    reach = max(0.1, float(np.quantile(np.abs(z), 0.999)))
-    style = {"s": 2.0, "cmap": GROUND, "vmin": -reach, "vmax": reach, "linewidths": 0}
-    dots = above.scatter(x, y, c=z, **style)
-    side.scatter(x, z, c=z, **style)
-    if sensors is not None:
-        at = np.atleast_2d(np.asarray(sensors, dtype=float))
-        above.plot(at[:, 0], at[:, 1], "x", color="#D55E00")
-        side.plot(at[:, 0], at[:, 2], "x", color="#D55E00")
-    for axes in (above, side):
-        axes.set_facecolor("#C9CED3")  # level ground is nearly white
-        axes.set_aspect("equal")
-        axes.tick_params(labelsize=8)
-    above.set(ylabel="y (m)")
-    side.set(xlabel=f"x (m)\n{len(points):,} points, from above and from the side", ylabel="z (m)")
-    figure.colorbar(dots, ax=[above, side], shrink=0.8, pad=0.01, label="height (m)")
-    above.set_title(title, **TITLE, loc="left")
-    return figure
-
-
-def difference(scanned: ElevationMap, truth: ElevationMap) -> ElevationMap:
-    """Return by how much a scanned map is too high, m; unknown where the scan is.
-
-    Raises `ConfigError` if the maps do not cover each other.
-    """
-    if scanned.shape != truth.shape or scanned.origin != truth.origin:
-        raise ConfigError(f"need maps of one area, got {scanned} and {truth}")
-    heights = np.where(scanned.known, scanned.heights - truth.heights, np.nan)
-    return ElevationMap(heights, scanned.resolution, scanned.origin)

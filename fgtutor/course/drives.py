@@ -1,0 +1,101 @@
+"""What the notebooks drive: functions as policies, a route straight ahead, many walks at once.
+
+Reads terrains, environments and zoos; gives routes, episodes and observations over time. Each
+function keeps one cell of a notebook short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict
+from torch import Tensor
+from tqdm import tqdm
+
+from fgtutor.baselines import AssessedMap, find_route, without_ood
+from fgtutor.errors import ConfigError
+from fgtutor.execution import Episode, FollowConfig, execute_batch
+from fgtutor.io.validation import Positive, check_arguments
+from fgtutor.robots.base import LocomotionEnv
+from fgtutor.routes import Route
+from fgtutor.specialist import Specialist
+from fgtutor.world.terrain import Terrain
+
+Point = tuple[float, float]
+HARDLY = 1e-9
+"""As good as no lower limit on feasibility: f is a sigmoid, and never quite 0."""
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """A driver that is a plain function: it can stand where `execute` wants a specialist."""
+
+    act: Callable[[TensorDict], Float[Tensor, "robots actions"]]
+    """Observations to actions."""
+    robot: str = "toy"
+    """What it drives."""
+    command: tuple[float, float, float] = (0.85, 0.0, 0.0)
+    """Commanded velocity (vx, vy, wz); m/s, m/s, rad/s."""
+    history: int = 0
+    """Frames of the past that it asks for."""
+
+
+def straight_route(terrain: Terrain, name: str) -> Route:
+    """Return the route that goes from start to goal along x as the crow flies, with one policy."""
+    grid = terrain.elevation
+    (first, row), (last, _) = grid.cell_of(*terrain.start), grid.cell_of(*terrain.goal)
+    ix = np.arange(first, last + 1)
+    cells = np.column_stack((ix, np.full_like(ix, row)))
+    steps = len(ix) - 1
+    return Route(
+        cells=cells,
+        xy=np.array([grid.centre_of(i, row) for i in ix.tolist()]),
+        headings=np.zeros(steps, dtype=int),
+        policies=np.zeros(steps, dtype=int),
+        feasibility=np.ones(steps),
+        costs=np.ones(steps),
+        length=steps * grid.resolution,
+        names=(name,),
+    )
+
+
+def collect(
+    env: LocomotionEnv, act: Callable[[TensorDict], Tensor], seconds: Positive
+) -> dict[str, Float[Tensor, "time envs _"]]:
+    """Let the robots of `env` act for a while; return every observation group over time."""
+    check_arguments(collect, locals(), ConfigError)
+    steps = round(seconds / env.control_dt)
+    observations = [env.get_observations()]
+    for _ in tqdm(range(steps - 1), unit="step"):
+        observations.append(env.step(act(observations[-1]))[0])
+    groups = list(observations[0].keys())  # a TensorDict iterates over its batch, not its names
+    return {name: torch.stack([step[name] for step in observations]) for name in groups}
+
+
+def drive_together(
+    jobs: Sequence[tuple[Route, Terrain, int]],
+    zoo: Mapping[str, Specialist],
+    *,
+    config: FollowConfig | None = None,
+) -> list[Episode]:
+    """Drive (route, terrain, seed) side by side, whatever policies each route was planned with.
+
+    A batch costs hardly more than one walk. Each episode counts policies as its own route does.
+    Terrains must have one size. Raises `ConfigError` if a route names a policy that the zoo lacks.
+    """
+    routes, terrains, seeds = zip(*jobs, strict=True) if jobs else ((), (), ())
+    return execute_batch(routes, terrains, zoo, seeds=seeds, config=config)
+
+
+def daring_route(ground: AssessedMap, start: Point, goal: Point, **changes: Any) -> Route:
+    """Return the best route if every f is believed wherever it is asked, however low it is.
+
+    Where ours refuses, this one goes: it shows whether the refusal was wise. `changes` are those of
+    `find_route`. Raises the reason, a `PlanningError`, if there is no such route either.
+    """
+    return find_route(without_ood, ground, start, goal, f_min=HARDLY, **changes).raise_for()

@@ -1,0 +1,194 @@
+"""Pictures of patches and of single headings: where a patch lies, what it shows, what F says there.
+
+Reads maps, poses, patches and tensors [nx, ny, 8]; gives matplotlib figures, as `figures.maps` does
+for whole maps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.image import AxesImage
+from matplotlib.patches import Polygon, Rectangle
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from fgtutor import directions, patches
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError
+from fgtutor.figures.maps import GROUND, draw_elevation
+from fgtutor.figures.style import INK, TITLE, Panels, Picture
+from fgtutor.io.validation import check_arguments
+from fgtutor.patches import PatchGrid, sample_patches
+
+COMPASS = ((1, 2), (0, 2), (0, 1), (0, 0), (1, 0), (2, 0), (2, 1), (2, 2))
+"""Row and column of each heading in a 3 x 3 picture: +x on the right, +y above."""
+SMALL = {"fontsize": 8.5, "loc": "left"}
+"""Titles of small panels."""
+
+
+def patch_at(elevation: ElevationMap, pose: ArrayLike, grid: PatchGrid) -> Float[Tensor, " points"]:
+    """Return the patch H_xy at a pose (x, y, yaw), cut from the prepared map as training does."""
+    ground = patches.prepare(elevation)
+    return sample_patches(
+        torch.tensor(ground.heights),
+        torch.tensor(np.asarray(pose), dtype=torch.float32),
+        grid,
+        resolution=ground.resolution,
+        origin=ground.origin,
+    )
+
+
+def draw_windows(elevation: ElevationMap, poses: ArrayLike, grid: PatchGrid) -> Picture:
+    """Draw on the map where the patches at some poses (x, y, yaw) lie, and where each one looks."""
+    figure = draw_elevation(elevation)
+    axes = figure.axes[0]
+    for pose in np.atleast_2d(np.asarray(poses, dtype=float)):
+        _window(axes, pose, grid)
+    axes.set_title("The windows that patches are cut from", **TITLE, loc="left")
+    axes.set_xlabel("x (m)\nThe arrow points ahead", fontsize=9)
+    return figure  # pyright: ignore[reportReturnType]
+
+
+def patch_gallery(
+    shown: Sequence[ArrayLike],
+    grid: PatchGrid,
+    captions: Sequence[str],
+    *,
+    columns: Panels = 4,
+    title: str = "",
+    unit: str = "height (m)",
+) -> Picture:
+    """Draw patches side by side, all in one scale of colours; the robot looks to the right.
+
+    Whatever has one number a point may be shown so, such as the weights of a network's first layer.
+    """
+    check_arguments(patch_gallery, locals(), ConfigError)
+    rows = -(-len(shown) // columns)
+    x, y = _span(grid)
+    figure = Picture(7.2, 0.45 + rows * (0.35 + 6.2 / columns * (y[1] - y[0]) / (x[1] - x[0])))
+    panels = np.ravel(figure.subplots(rows, columns, squeeze=False))
+    reach = max(0.1, *(float(np.abs(np.asarray(values)).max()) for values in shown))
+    image = None
+    for axes, values, caption in zip(panels, shown, captions, strict=False):
+        image = _patch(axes, values, grid, reach)
+        axes.set_title(caption, fontsize=8.5, loc="left")
+    for axes in panels[len(shown) :]:
+        axes.remove()
+    if image is not None:
+        figure.colorbar(image, ax=figure.axes, shrink=0.8, pad=0.01, label=unit)
+    figure.suptitle(title, **TITLE, x=0.01)
+    return figure
+
+
+def patch_rose(elevation: ElevationMap, x: float, y: float, grid: PatchGrid) -> Picture:
+    """Draw the eight patches of one place, each at its side of the map's window around the place.
+
+    Every patch is turned so that the robot looks to the right: this is what a network is shown.
+    """
+    figure = Picture(7.6, 6.2)
+    poses = np.column_stack((np.tile((x, y), (directions.NUM_HEADINGS, 1)), directions.YAWS))
+    shown = patch_at(elevation, poses, grid).numpy()
+    reach = max(0.1, float(np.abs(shown).max()))
+    around = 1.1 * patches.reach(grid)
+    panels = figure.subplots(3, 3)
+    _compass(
+        panels,
+        lambda axes, heading: _patch(axes, shown[heading], grid, reach),
+        elevation.crop(x - around, y - around, x + around, y + around),
+        label="height (m)",
+    )
+    panels[1, 1].set(xticks=(), yticks=())
+    panels[1, 1].set_title("the place on the map", **SMALL)
+    for pose in poses:
+        _window(panels[1, 1], pose, grid, colour="#00000055")
+    figure.suptitle("One place, eight headings, eight patches", **TITLE, x=0.01)
+    return figure
+
+
+def heading_maps(tensor: ArrayLike, grid: ElevationMap, *, label: str = "F") -> Picture:
+    """Draw the eight channels of a tensor [nx, ny, 8], each at the side that its heading points to.
+
+    In the middle lies the map.
+    """
+    values = np.asarray(tensor)
+    width, height = grid.size
+    figure = Picture(7.6, float(np.clip(7.0 * height / width, 2.0, 7.0)) + 0.8)
+    x0, y0, x1, y1 = grid.extent
+    _compass(
+        figure.subplots(3, 3, sharex=True, sharey=True),
+        # An image is [row = y, column = x]: transpose, with its first row at the bottom.
+        lambda axes, heading: axes.imshow(
+            values[..., heading].T, origin="lower", extent=(x0, x1, y0, y1), vmin=0, vmax=1
+        ),
+        grid,
+        label=label,
+    )
+    figure.suptitle(f"{label}: one map per heading", **TITLE, x=0.01)
+    return figure
+
+
+def _compass(
+    panels: np.ndarray,
+    draw: Callable[[Axes, int], AxesImage],
+    middle: ElevationMap,
+    *,
+    label: str,
+) -> None:
+    """Draw something for each heading at the side that it points to, and a map in the middle."""
+    image = None
+    for heading, place in enumerate(COMPASS):
+        image = draw(panels[place], heading)
+        panels[place].set_title(f"heading {heading}: {directions.NAMES[heading]}", **SMALL)
+    figure = draw_elevation(middle, axes=panels[1, 1], bare=True)
+    panels[1, 1].set_title("the map", **SMALL)
+    if image is not None:
+        figure.colorbar(image, ax=list(panels.flat), shrink=0.6, pad=0.01, label=label)
+
+
+def _span(grid: PatchGrid) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the area that a patch's points stand for, in the robot's yaw frame, m."""
+    half = grid.spacing / 2
+    (x0, y0), (x1, y1) = grid.points.amin(0).tolist(), grid.points.amax(0).tolist()
+    return (x0 - half, x1 + half), (y0 - half, y1 + half)
+
+
+def _patch(axes: Axes, values: ArrayLike, grid: PatchGrid, reach: float) -> AxesImage:
+    """Show one number a point, with the robot's footprint and where it looks."""
+    (x0, x1), (y0, y1) = _span(grid)
+    # Points are [x, y]; an image is [row = y, column = x]: transpose, first row at the bottom.
+    image = axes.imshow(
+        np.asarray(values).reshape(grid.shape).T,
+        cmap=GROUND,
+        norm=Normalize(-reach, reach),
+        origin="lower",
+        extent=(x0, x1, y0, y1),
+    )
+    length, width = grid.footprint
+    axes.add_patch(
+        Rectangle((-length, -width), 2 * length, 2 * width, fill=False, edgecolor=INK, linewidth=1)
+    )
+    axes.plot((0, length), (0, 0), color=INK, linewidth=1)
+    axes.set(xticks=(), yticks=())
+    return image
+
+
+def _window(axes: Axes, pose: ArrayLike, grid: PatchGrid, colour: str = "#D55E00") -> None:
+    """Outline on a map the area of a patch, and point ahead."""
+    x, y, yaw = np.asarray(pose, dtype=float)
+    (x0, x1), (y0, y1) = _span(grid)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    corners = np.array(((x0, y0), (x1, y0), (x1, y1), (x0, y1)))
+    outline = corners @ np.array(((cos, sin), (-sin, cos))) + (x, y)
+    axes.add_patch(Polygon(outline, fill=False, edgecolor=colour, linewidth=1.5))
+    axes.annotate(
+        "",
+        (x + 0.8 * x1 * cos, y + 0.8 * x1 * sin),
+        (x, y),
+        arrowprops={"arrowstyle": "->", "color": colour},
+    )

@@ -1,0 +1,131 @@
+"""What the canvas of a widget shows: pictures of one map side by side, a route on top, and texts.
+
+Reads what an `Explorer` or a `Painting` computed; gives the plain values that `static/panels.js`
+draws. Nothing here knows the notebook.
+
+Arrays are [ix, iy], but a picture has its rows first and y = 0 at the bottom: `upright` turns them,
+and points of the overlay count (right, down) in cells from the picture's upper left corner.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import matplotlib
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from matplotlib.colors import to_rgb
+
+from fgtutor import directions
+from fgtutor.elevation import ElevationMap
+from fgtutor.errors import ConfigError
+from fgtutor.figures.maps import BLOCKED, UNKNOWN, relief
+
+Cell = tuple[int, int]
+Point = tuple[float, float]
+CIVIDIS = (matplotlib.colormaps["cividis"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
+"""Colours of F: they differ in brightness too, so the colour-blind read them alike."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """One picture of the map."""
+
+    key: str
+    """Which of the scene's pictures it shows."""
+    title: str
+    """What it is."""
+    caption: str = ""
+    """What to see in it."""
+    colour: str = ""
+    """Colour of the title, "#RRGGBB", where the picture belongs to one policy."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """Everything a view draws."""
+
+    rows: Sequence[Sequence[Panel]]
+    """The panels, row by row; those of a row share its width."""
+    pictures: Mapping[str, UInt8[np.ndarray, "ny nx 3"]]
+    """One colour a cell, upright, by panel key."""
+    lines: Sequence[tuple[str, Sequence[Point]]] = field(default_factory=tuple)
+    """Polylines over every panel: a colour and points (right, down), in cells."""
+    marks: Mapping[str, Point] = field(default_factory=dict)
+    """Where "start" and "goal" lie."""
+    box: tuple[float, float, float, float] | None = None
+    """A rectangle (left, top, right, bottom) to outline, in cells."""
+    legend: Mapping[str, str] = field(default_factory=dict)
+    """Colours by name."""
+    status: str = ""
+    """One line of text that says what came out."""
+
+
+def upright(values: np.ndarray) -> np.ndarray:
+    """Turn an array [ix, iy, ...] into a picture: x to the right, y up."""
+    return np.ascontiguousarray(np.swapaxes(values, 0, 1)[::-1])
+
+
+def on_picture(cells: Float[np.ndarray, "n 2"], ny: int) -> list[Point]:
+    """Return where the centres of cells (ix, iy) lie in a picture of `ny` rows, (right, down)."""
+    return [(ix + 0.5, ny - iy - 0.5) for ix, iy in np.asarray(cells).tolist()]
+
+
+def shades(low: str, high: str) -> UInt8[np.ndarray, "256 3"]:
+    """Return 256 colours from one to another."""
+    way = np.linspace(0, 1, 256)[:, None]
+    return (((1 - way) * to_rgb(low) + way * to_rgb(high)) * 255).round().astype(np.uint8)
+
+
+def level(values: Float[np.ndarray, "nx ny"]) -> UInt8[np.ndarray, "nx ny"]:
+    """Return values in [0, 1] as indices into 256 colours."""
+    return (values * 255 + 0.5).astype(np.uint8)
+
+
+def feasibility_picture(
+    best: Float[np.ndarray, "nx ny"], known: Bool[np.ndarray, "nx ny"], f_min: float
+) -> UInt8[np.ndarray, "ny nx 3"]:
+    """Colour F, one number a cell; dark where it is below `f_min`."""
+    picture = CIVIDIS[upright(level(best))]
+    picture[upright(best < f_min)] = rgb(BLOCKED)
+    return mark_unknown(picture, known)
+
+
+def ground_picture(elevation: ElevationMap) -> UInt8[np.ndarray, "ny nx 3"]:
+    """Colour the heights of a map exactly as `figures.draw_elevation` does."""
+    colours, _ = relief(elevation)
+    return mark_unknown(upright((colours * 255).round().astype(np.uint8)), elevation.known)
+
+
+def mark_unknown(
+    picture: UInt8[np.ndarray, "ny nx 3"], known: Bool[np.ndarray, "nx ny"]
+) -> UInt8[np.ndarray, "ny nx 3"]:
+    """Grey out the cells that were never observed, in place; return the picture."""
+    if not known.all():
+        picture[upright(~known)] = rgb(UNKNOWN)
+    return picture
+
+
+def rgb(colour: str) -> UInt8[np.ndarray, "3"]:
+    """Return a colour by name or #RRGGBB as three bytes."""
+    return (np.array(to_rgb(colour)) * 255).round().astype(np.uint8)
+
+
+def check_cell(elevation: ElevationMap, cell: Cell) -> None:
+    """Raise `ConfigError` for a cell off the map."""
+    nx, ny = elevation.shape
+    if not (0 <= cell[0] < nx and 0 <= cell[1] < ny):
+        raise ConfigError(f"there is no cell {cell} on a map of {nx} x {ny} cells")
+
+
+def cell_table(
+    elevation: ElevationMap, cell: Cell, rows: Mapping[str, Sequence[float] | Sequence[str]]
+) -> str:
+    """Say what is known of a cell: its place and height, then eight values a row, by heading."""
+    x, y = elevation.centre_of(*cell)
+    height = f"height {elevation.heights[cell]:.2f} m"
+    known = height if elevation.known[cell] else "never observed: closed"
+    lines = [f"cell ({cell[0]}, {cell[1]})   x {x:.2f} m, y {y:.2f} m, {known}"]
+    for label, values in {"heading": directions.NAMES, **rows}.items():
+        texts = [value[:7] if isinstance(value, str) else f"{value:.2f}" for value in values]
+        lines.append(f"{label:<11.11}" + "".join(f"{text:>8}" for text in texts))
+    return "\n".join(lines)

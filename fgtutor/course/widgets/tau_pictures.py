@@ -1,0 +1,159 @@
+"""How an `Explorer` looks: the scene of its widget, and a picture for pages without a kernel.
+
+Reads an `Explorer`; gives a `Scene` of M, F_max, P and every policy's w_ood with the route on top,
+or one figure with loose, paper and strict taus side by side. Source: the figures' own colours.
+"""
+
+import itertools
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from matplotlib.patches import Patch
+
+from fgtutor.course.widgets.explorer import Explorer
+from fgtutor.course.widgets.panels import (
+    Panel,
+    Point,
+    Scene,
+    feasibility_picture,
+    ground_picture,
+    level,
+    mark_unknown,
+    on_picture,
+    rgb,
+    shades,
+    upright,
+)
+from fgtutor.feasibility import TAU_HIGH, TAU_LOW
+from fgtutor.figures.maps import BLOCKED, draw_policy_map, draw_route, draw_weight
+from fgtutor.figures.style import TITLE, Picture, policy_colours
+
+TAU_CHOICES = {
+    "loose": (5 * TAU_LOW, 5 * TAU_HIGH),
+    "paper": (TAU_LOW, TAU_HIGH),
+    "strict": (TAU_LOW / 5, TAU_HIGH / 5),
+}
+"""The paper's thresholds, five times looser and five times stricter, for `tau_figure`."""
+PANELS = (
+    Panel(key="M", title="Elevation map M", caption="blue: below the usual ground; brown: above"),
+    Panel(key="F", title="F_max, best heading", caption="yellow: feasible; dark: no way out"),
+    Panel(
+        key="P", title="Policy map P", caption="the policy that would drive; paler: less feasible"
+    ),
+)
+
+
+class TauPictures:
+    """Turns an explorer into scenes; what never changes is drawn once."""
+
+    def __init__(self, explorer: Explorer) -> None:
+        self.explorer = explorer
+        self.colours = policy_colours(explorer.names)
+        self._ground = ground_picture(explorer.elevation)
+        self._shades = {name: shades("white", colour) for name, colour in self.colours.items()}
+        # As in `draw_policy_map`: a fifth of the colour where F is 0, all of it where F is 1.
+        strength = np.linspace(0.2 * 255, 255, 256).round().astype(int)
+        self._tints = np.stack([own[strength] for own in self._shades.values()])
+
+    def scene(self) -> Scene:
+        """Draw the explorer as it stands."""
+        explorer = self.explorer
+        f_min, known = explorer.settings.f_min, explorer.elevation.known
+        best, policy = explorer.best
+        chosen = self._tints[upright(policy), upright(level(best))]
+        chosen[upright(best < f_min)] = rgb(BLOCKED)
+        pictures = {
+            "M": self._ground,
+            "F": feasibility_picture(best, known, f_min),
+            "P": mark_unknown(chosen, known),
+        }
+        weights = []
+        for name, weight in explorer.weights.items():
+            key = f"w {name}"
+            picture = self._shades[name][upright(level(weight.mean(dim=-1).numpy()))]
+            pictures[key] = mark_unknown(picture, known)
+            weights.append(
+                Panel(
+                    key=key,
+                    title=f"w_ood of {name}",
+                    caption="colour: seen before; white: never",
+                    colour=self.colours[name],
+                )
+            )
+        return Scene(
+            rows=(PANELS, weights),
+            pictures=pictures,
+            lines=self._lines(),
+            marks={
+                role: self._on_picture([explorer.elevation.cell_of(*point)])[0]
+                for role, point in (("start", explorer.start), ("goal", explorer.goal))
+            },
+            legend=self.colours | {"blocked": BLOCKED},
+            status=explorer.status,
+        )
+
+    def _on_picture(self, cells: object) -> list[Point]:
+        return on_picture(np.asarray(cells), self.explorer.elevation.shape[1])
+
+    def _lines(self) -> list[tuple[str, list[Point]]]:
+        """Cut the route where the policy changes: one polyline a stretch, in its colour."""
+        route = self.explorer.route
+        if route is None or not len(route.policies):
+            return []
+        points, policies = self._on_picture(route.cells), route.policies
+        cuts = [0, *(np.flatnonzero(np.diff(policies)) + 1).tolist(), len(policies)]
+        return [
+            (self.colours[route.names[policies[a]]], points[a : b + 1])
+            for a, b in itertools.pairwise(cuts)
+        ]
+
+
+def tau_figure(
+    explorer: Explorer, taus: Mapping[str, tuple[float, float]] = TAU_CHOICES
+) -> Picture:
+    """Draw what each choice of taus makes of the map, side by side: a page without sliders.
+
+    The upper row shows how well the policy that knows a cell best knows it. The explorer is left as
+    it was. Raises `ThresholdError` for taus that are not tau_low <= tau_high.
+    """
+    before, elevation = explorer.settings.taus, explorer.elevation
+    aspect = elevation.size[1] / elevation.size[0]
+    figure = Picture(4.2 * len(taus), 2 * (3.6 * aspect + 1.0) + 0.6)
+    try:
+        for (above, below), (name, (low, high)) in zip(
+            figure.subplots(2, len(taus), squeeze=False).T, taus.items(), strict=True
+        ):
+            explorer.update(taus=(low, high))
+            draw_weight(
+                torch.stack([*explorer.weights.values()]).amax(dim=0), elevation, axes=above
+            )
+            above.set_title(f"{name}: tau {low:g} to {high:g}", **TITLE, loc="left")
+            above.set_xlabel("dark: some policy has seen such ground", fontsize=9)
+            draw_policy_map(
+                explorer.policy_map,
+                explorer.fused,
+                elevation,
+                explorer.names,
+                f_min=explorer.settings.f_min,
+                axes=below,
+            )
+            said = "no route: not enough ground is known"
+            if explorer.route is not None:
+                draw_route(explorer.route, elevation, axes=below)
+                said = explorer.status.split(": ", 1)[1].split(" (")[0]
+            below.set_title("P and the route", **TITLE, loc="left")
+            below.set_xlabel(f"x (m)\n{said}", fontsize=9)
+    finally:
+        explorer.update(taus=before)
+    # Every panel brought a legend of its own, and they would lie on top of each other.
+    figure.legends.clear()
+    colours = policy_colours(explorer.names) | {"blocked": BLOCKED}
+    figure.legend(
+        handles=[Patch(color=colour, label=name) for name, colour in colours.items()],
+        loc="outside lower center",
+        ncols=len(colours),
+        frameon=False,
+        fontsize=9,
+    )
+    return figure
