@@ -19,11 +19,7 @@ from fgtutor.errors import FgtutorError
 COMMANDS = {
     "demo": ("cli.demo", "DemoConfig", "plan over a mixed terrain and drive it"),
     "train": ("learning.training", "config_of", "train a specialist with its Feasibility-Net"),
-    "sweep": (
-        "evaluation.sweep",
-        "config_of",
-        "train many specialists side by side, and compare them",
-    ),
+    "sweep": ("evaluation.sweep", "config_of", "train specialists side by side and compare them"),
     "plan": ("cli.plan", "PlanConfig", "plan a route over a map file"),
     "evaluate matrix": (
         "evaluation.matrix",
@@ -58,36 +54,23 @@ COMMANDS = {
     "map": ("cli.map", "MapConfig", "turn a point cloud into an elevation map"),
     "export": ("cli.export", "ExportConfig", "write a policy as ONNX, with what it observes"),
     "notebooks": ("course.notebooks", "NotebooksConfig", "execute the course's notebooks"),
-    "exercises": (
-        "course.exercises",
-        "ExercisesConfig",
-        "build the exercises from their masters",
-    ),
-    "grade": (
-        "course.grading.grade",
-        "GradeConfig",
-        "grade one exercise notebook or a whole class",
-    ),
+    "exercises": ("course.exercises", "ExercisesConfig", "build the exercises from their masters"),
+    "grade": ("course.grading.grade", "GradeConfig", "grade one exercise notebook or a class"),
     "doctor": ("cli.doctor", "DoctorConfig", "say what this machine has, lacks and needs"),
 }
-"""Command: module under fgtutor, its config dataclass (or what picks it), what it is for."""
+"""Command: its module, the config dataclass there (or the function that picks it), its purpose."""
 
 USAGE, INTERRUPTED, TERMINATED, UNREAD = 2, 130, 143, 141
 """Exit codes: a mistake that the message explains; then, as shells report them, 128 + SIGINT
-(Ctrl-C), SIGTERM, and SIGPIPE: whoever read the output has stopped reading."""
+(Ctrl-C), 128 + SIGTERM, and 128 + SIGPIPE, when the program that read the output has ended."""
 
 
 def overview() -> str:
     """Return the list of commands."""
-    rows = (f"  {name:<20} {what}" for name, (_, _, what) in COMMANDS.items())
-    return "\n".join(
-        [
-            f"fgtutor {__version__}: feasibility-guided planning over locomotion specialists",
-            "",
-            "usage: fgtutor COMMAND [--help] [--options]",
-            "",
-            *rows,
-        ]
+    commands = "\n".join(f"  {name:<20} {what}" for name, (_, _, what) in COMMANDS.items())
+    return (
+        f"fgtutor {__version__}: feasibility-guided planning over locomotion specialists\n\n"
+        f"usage: fgtutor COMMAND [--help] [--options]\n\n{commands}"
     )
 
 
@@ -116,7 +99,7 @@ def _run(command: str, options: Sequence[str]) -> int:
     """Import a command's module, let tyro fill its dataclass, and run it."""
     module_name, config_name, _ = COMMANDS[command]
     try:
-        from fgtutor.io.progress import waiting  # here: `fgtutor --help` needs none of it
+        from fgtutor.io.progress import waiting  # not at the top: `--help` must be quick
         from fgtutor.io.validation import parse_options
 
         with waiting(f"fgtutor {command}: loading") if sys.stderr.isatty() else nullcontext():
@@ -125,7 +108,7 @@ def _run(command: str, options: Sequence[str]) -> int:
         if not isinstance(config_class, type):
             config_class = config_class(options)
         config = parse_options(config_class, options, f"fgtutor {command}")
-        with _ends_in_order():
+        with _sigterm_as_exit():
             return module.run(config) or 0
     except FgtutorError as error:
         print(f"fgtutor {command}: {error}", file=sys.stderr)
@@ -142,22 +125,22 @@ def _run(command: str, options: Sequence[str]) -> int:
         print(f"fgtutor {command}: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # Python writes what is left when it ends, and would complain once more.
+        # Python flushes stdout when it ends, and would fail once more.
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNREAD
 
 
 @contextmanager
-def _ends_in_order() -> Iterator[None]:
-    """Let SIGTERM end the command as an exception does: files half written are removed."""
+def _sigterm_as_exit() -> Iterator[None]:
+    """Let SIGTERM end the block by an exception, so that files half written are removed."""
 
     def end(*_: Any) -> None:
         raise SystemExit(TERMINATED)
 
     try:
         before = signal.signal(signal.SIGTERM, end)
-    except ValueError:  # not the main thread, where no signal arrives
+    except ValueError:  # signals arrive in the main thread only, and this is another
         yield
         return
     try:
