@@ -9,7 +9,8 @@ from fgtutor.errors import ConfigError
 from fgtutor.robots.a1 import ground
 from fgtutor.robots.a1 import model as a1_model
 from fgtutor.robots.a1.looks import dress
-from fgtutor.world.terrain import Box, make_terrain
+from fgtutor.world.boxes import Box
+from fgtutor.world.terrain import make_terrain
 
 SLICES = a1_model.sensor_slices()
 

@@ -11,8 +11,9 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import CloudError, ConfigError
 from fgtutor.robots.a1.model import STANCE_HEIGHT, TRUNK_SIZE
 from fgtutor.robots.lidar import LidarConfig, carried, pattern, scan_terrain, survey
+from fgtutor.world.boxes import Box
 from fgtutor.world.scanning import ScanConfig, map_points
-from fgtutor.world.terrain import Box, Terrain, make_terrain
+from fgtutor.world.terrain import Terrain, make_terrain
 
 SILENT = {"range_noise": 0.0, "angle_noise": 0.0, "position_noise": 0.0, "attitude_noise": 0.0}
 ABOVE = np.array([[4.0, 2.0, 1.5, np.pi, 0.0, 0.0]])

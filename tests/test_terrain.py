@@ -13,15 +13,8 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import OffMapError, TerrainError
 from fgtutor.patches import PatchGrid, prepare, sample_patches
 from fgtutor.robots import ROBOTS
-from fgtutor.world.terrain import (
-    TERRAINS,
-    Box,
-    Terrain,
-    World,
-    boxes_from_elevation,
-    make_terrain,
-    rasterise,
-)
+from fgtutor.world.boxes import Box, boxes_from_elevation, rasterise
+from fgtutor.world.terrain import TERRAINS, Terrain, World, make_terrain
 
 OBSTACLES = tuple(name for name in TERRAINS if name not in ("flat", "mixed"))
 angles = st.floats(-1.2, 1.2)

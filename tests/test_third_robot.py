@@ -11,7 +11,7 @@ from fgtutor.cli.export import describe
 from fgtutor.evaluation.switching import SwitchingConfig, courses
 from fgtutor.learning.config import TrainConfig, config_of
 from fgtutor.robots import ROBOTS, Robot
-from fgtutor.world.terrain import TerrainScale
+from fgtutor.world.obstacles import TerrainScale
 
 PUCK = Robot(env="puck:PuckEnv", scale=TerrainScale(resolution=0.1, mixed=("steps", "gaps")))
 CONTRACT = [

@@ -31,7 +31,8 @@ from fgtutor.io.validation import (
 from fgtutor.robots.a1.ground import add_box
 from fgtutor.robots.a1.looks import dress
 from fgtutor.robots.a1.model import STANCE, STANCE_HEIGHT, build_spec
-from fgtutor.world.terrain import Terrain, boxes_from_elevation
+from fgtutor.world.boxes import boxes_from_elevation
+from fgtutor.world.terrain import Terrain
 
 MOST_RAYS = 10_000_000
 """Rays from one pose; each takes some 100 bytes."""

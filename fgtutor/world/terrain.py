@@ -21,18 +21,6 @@ from fgtutor.robots import ROBOTS
 from fgtutor.world.boxes import Box, boxes_from_elevation, rasterise
 from fgtutor.world.obstacles import OBSTACLES, SPREAD, Course, Resolution, TerrainScale
 
-__all__ = [
-    "TERRAINS",
-    "Box",
-    "Section",
-    "Terrain",
-    "TerrainScale",
-    "World",
-    "boxes_from_elevation",
-    "make_terrain",
-    "rasterise",
-]
-
 Point = tuple[float, float]
 TerrainSeed = Annotated[int, Interval(ge=0, lt=2**63)]
 """What a layout is drawn from: odd ones where terrain is evaluated, even ones in training."""
