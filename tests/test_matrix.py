@@ -1,67 +1,78 @@
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fgtutor.__main__ import main
 from fgtutor.baselines import ours
-from fgtutor.errors import ConfigError, ReportError, StorageError, TerrainError
+from fgtutor.errors import ConfigError, ReportError, TerrainError
 from fgtutor.evaluation import ablation, success
 from fgtutor.evaluation.ablation import AblationConfig
 from fgtutor.evaluation.cost import Cost
-from fgtutor.evaluation.matrix import MatrixConfig, evaluate, policies, run, table
+from fgtutor.evaluation.matrix import MatrixConfig, policies, run, table
 from fgtutor.evaluation.shards import collect
 from fgtutor.evaluation.success import (
     make_ground,
     make_tasks,
-    summarise,
+    run_task,
     terrain_seed,
     with_random_ends,
 )
-from fgtutor.evaluation.trials import Ground, Trial, drive
+from fgtutor.evaluation.trials import (
+    Ground,
+    TrialRow,
+    by_cell,
+    drive,
+    drive_plans,
+    failures,
+    plan_all,
+)
 from fgtutor.execution import FollowConfig
+from fgtutor.settings import PlanSettings
+from fgtutor.statistics import Share
 from fgtutor.world.terrain import make_terrain
+
+POLICIES = ("gaps", "steps", "ours", "general")
+ROW = ["terrain", "policy", "ground", "seed", "outcome", "length", "seconds", "switches"]
 
 
 @pytest.fixture
 def config(zoo):
-    return MatrixConfig(
-        trials=3, terrains=("flat", "gaps"), zoo=zoo, workers=1, json=zoo.parent / "rows.json"
-    )
+    return MatrixConfig(trials=3, terrains=("flat", "gaps"), zoo=zoo, workers=1)
+
+
+def evaluate(config, policies=POLICIES):
+    """Return the trials of a table, as the command would drive them."""
+    tasks = make_tasks(config, config.terrains, policies, run_task)
+    return collect(tasks, {}, config).rows
 
 
 @pytest.mark.slow
 def test_rows_name_every_outcome(config):
-    rows = {(row["terrain"], row["policy"]): row for row in evaluate(config)}
-    assert list(rows) == [
-        (terrain, policy)
-        for terrain in ("flat", "gaps")
-        for policy in ("gaps", "steps", "ours", "general")
-    ]
-    for row in rows.values():
-        assert list(row) == ["terrain", "policy", "trials", "successes", "ci95", "failures"]
-        assert row["trials"] == 3 == row["successes"] + sum(row["failures"].values())
-        assert set(row["failures"]) == {"no_route", "fell", "timeout"}
-        assert 0 <= row["ci95"][0] <= row["successes"] / 3 <= row["ci95"][1] <= 1
+    rows = evaluate(config)
+    cells = by_cell(rows)
+    assert list(cells) == [(terrain, policy) for terrain in ("flat", "gaps") for policy in POLICIES]
+    for cell in cells.values():
+        assert all(list(row) == ROW for row in cell)
+        assert len(cell) == 3 == Share.reached(cell).successes + sum(failures(cell))
     # On flat ground rolling is enough; a policy that predicts f = 0.05 refuses everywhere (f_min).
-    assert rows["flat", "steps"]["successes"] == rows["flat", "ours"]["successes"] == 3
-    assert rows["flat", "gaps"]["failures"]["no_route"] == 3
+    for policy in ("steps", "ours"):
+        assert [row["outcome"] for row in cells["flat", policy]] == ["reached"] * 3
+    assert failures(cells["flat", "gaps"]) == [3, 0, 0]
     # A rolling toy that believes in itself drops an axle into the first gap, and hangs there.
-    assert rows["gaps", "steps"]["successes"] == 0
-    assert rows["gaps", "steps"]["failures"]["no_route"] == 0
+    refused, *failed = failures(cells["gaps", "steps"])
+    assert refused == 0 and sum(failed) == 3
     # A part of the table is that part of the whole.
-    part = evaluate(replace(config, terrains=("flat",), policies=("ours",)))
-    assert part == [rows["flat", "ours"]]
+    part = evaluate(replace(config, terrains=("flat",)), ("ours",))
+    assert part == cells["flat", "ours"]
 
 
 @pytest.mark.slow
 def test_the_number_of_workers_changes_nothing(config, monkeypatch):
     monkeypatch.setattr(success, "GROUNDS", 2)
-    tasks = make_tasks(config, ("flat",), ("ours",))
-    alone, together = (
-        collect(tasks, {}, replace(config, workers=workers)).rows for workers in (1, 2)
-    )
+    config = replace(config, terrains=("flat",))
+    alone, together = (evaluate(replace(config, workers=workers), ("ours",)) for workers in (1, 2))
     assert len(alone) == 3 and alone == together  # every length, to the millimetre
 
 
@@ -69,31 +80,39 @@ def test_the_number_of_workers_changes_nothing(config, monkeypatch):
 def test_another_zoo_and_other_settings_are_another_run(config):
     config = replace(config, trials=1, terrains=("flat",), policies=("steps",))
     config = replace(config, out=config.zoo.parent / "out")
-    evaluate(config)
+    run(config)
     with pytest.raises(ReportError, match=r"f_min was .* and is 0\.2"):
-        evaluate(replace(config, f_min=0.2))
+        run(replace(config, f_min=0.2))
     description = config.zoo / "steps" / "specialist.json"
     description.write_text(description.read_text() + "\n")
     with pytest.raises(ReportError, match="zoo was"):
-        evaluate(config)
+        run(config)
 
 
 @pytest.mark.slow
 def test_more_trials_in_the_same_folder_drive_only_the_new_ones(config, monkeypatch):
     monkeypatch.setattr(success, "GROUNDS", 2)
     few = replace(config, terrains=("flat",), policies=("steps",), out=config.zoo.parent / "few")
-    evaluate(few)
+    run(few)
     more = replace(few, trials=5)
-    whole = evaluate(replace(more, out=None))
+    run(replace(more, out=config.zoo.parent / "more"))
     drawn, make = [], success.make_ground
     monkeypatch.setattr(success, "make_ground", lambda *w: drawn.append(w[-1]) or make(*w))
-    assert evaluate(more) == whole and whole[0]["trials"] == 5
-    assert drawn == [2, 3, 4]  # of the second task only one ground was there
-    assert evaluate(few)[0]["trials"] == 3 and drawn == [2, 3, 4]
+    assert rows_in(config.zoo.parent / "more") != rows_in(few.out)
+    run(more)
+    assert rows_in(more.out) == rows_in(config.zoo.parent / "more")
+    # Of the second task only one ground was there; the first one of all is for the estimate.
+    assert drawn == [0, 2, 3, 4]
+    run(few)
+    assert len(rows_in(few.out)) == 3 and drawn == [0, 2, 3, 4]
     # By the paper's protocol, a ground stands for every 40th of the trials.
-    evaluate(replace(few, protocol="paper", out=config.zoo.parent / "paper"))
+    run(replace(few, protocol="paper", out=config.zoo.parent / "paper"))
     with pytest.raises(ReportError, match="trials was 3 and is 5"):
-        evaluate(replace(more, protocol="paper", out=config.zoo.parent / "paper"))
+        run(replace(more, protocol="paper", out=config.zoo.parent / "paper"))
+
+
+def rows_in(folder):
+    return json.loads((folder / "rows.json").read_text())
 
 
 @pytest.mark.slow
@@ -101,8 +120,6 @@ def test_the_command_writes_rows_and_a_report_and_prints_a_table(config, capsys)
     folder = config.zoo.parent / "report"
     config = replace(config, terrains=("flat",), out=folder)
     assert run(config) == 0
-    rows = json.loads(config.json.read_text())
-    assert [row["policy"] for row in rows] == ["gaps", "steps", "ours", "general"]
     printed = capsys.readouterr().out
     line = "| flat | 0 (0-56) | 100 (44-100) | 100 (44-100) | 100 (44-100) |"
     assert line in printed and "3 trials a cell" in printed
@@ -110,8 +127,8 @@ def test_the_command_writes_rows_and_a_report_and_prints_a_table(config, capsys)
     assert "1 of 1 tasks to do" in printed and "9 maps" in printed and "12 episodes" in printed
     assert "on 1 core like this one" in printed
 
-    trials = json.loads((folder / "rows.json").read_text())
-    assert len(trials) == 12 and trials[0].keys() == asdict(Trial(**trials[0])).keys()
+    trials = rows_in(folder)
+    assert len(trials) == 12 and set(trials[0]) == set(TrialRow.__annotations__)
     reached = [trial for trial in trials if trial["outcome"] == "reached"]
     assert len(reached) == 9 and all(trial["length"] > 5 for trial in reached)
     assert (
@@ -135,7 +152,7 @@ def test_the_papers_protocol_is_300_000_trials(config):
     assert config.count == 10_000 and config.grounds == 40
     six = ("bridge", "gaps", "steps", "valley", "ours", "general")
     terrains = ("steps", "gaps", "bridge", "valley", "mixed")
-    tasks = make_tasks(config, terrains, six)
+    tasks = make_tasks(config, terrains, six, run_task)
     assert len(tasks) == len({task.name for task in tasks}) == 200
     # Task k of a terrain is ground k; trial t is driven on ground t mod 40.
     *_, grounds = tasks[41].arguments
@@ -180,50 +197,60 @@ def test_planning_may_see_another_map_than_the_truth(make_rolling):
     truth, other = (make_terrain(name, robot="toy", seed=1) for name in ("flat", "gaps"))
     zoo = {"steps": make_rolling("steps")}
     misled = Ground(terrain=other, seeds=(1, 2), seen=truth.elevation)
-    trials = drive([misled], {"ours": ours}, zoo, follow=FollowConfig(patience=0.0, grace=1.0))
+    plans = plan_all(ours, [misled], [misled.assess(zoo, PlanSettings())], PlanSettings())
+    follow = FollowConfig(patience=0.0, grace=1.0)
+    trials = list(drive_plans("ours", plans, zoo, follow))
     assert [trial.outcome for trial in trials] == ["timeout", "timeout"]  # after one second
-    assert [trial.seed for trial in trials] == [1, 2] and trials[0].seconds == pytest.approx(1.0)
+    assert [trial.seed for trial in trials] == [1, 2]
+    assert trials[0].row["seconds"] == pytest.approx(1.0)
 
 
-def test_summary_by_hand():
+def test_a_trial_says_what_was_planned_and_how_it_ended(make_rolling):
+    ground = Ground(terrain=make_terrain("flat", robot="toy", seed=1), seeds=(1,))
+    zoo = {"steps": make_rolling("steps")}
+    (trial,) = drive([ground], {"ours": ours}, zoo, settings=PlanSettings())
+    assert trial.terrain == "flat" and trial.route is trial.planned.answer
+    assert trial.row == {
+        "terrain": "flat", "policy": "ours", "ground": 1, "seed": 1, "outcome": "reached",
+        "length": trial.length, "seconds": round(trial.episode.seconds, 3), "switches": 0,
+    }  # fmt: skip
+    (refused,) = drive([ground], {"ours": ours}, zoo, settings=PlanSettings(f_min=0.99))
+    assert (refused.route, refused.episode, refused.outcome) == (None, None, "no_route")
+    assert (refused.length, refused.row["seconds"], refused.row["switches"]) == (0.0, 0.0, 0)
+
+
+def test_the_table_by_hand():
     outcomes = ("reached", "reached", "fell", "no_route")
-    trials = [
-        asdict(Trial(terrain="t", policy="p", ground=1, seed=i, outcome=outcome))
-        for i, outcome in enumerate(outcomes)
-    ]
-    row = summarise(trials)
-    assert row["successes"] == 2 and row["failures"] == {"no_route": 1, "fell": 1, "timeout": 0}
-    assert row["ci95"] == pytest.approx([0.15, 0.85], abs=0.005)  # Wilson's interval for 2 of 4
+    trials = [{"terrain": "t", "policy": "p", "outcome": outcome} for outcome in outcomes]
+    assert failures(trials) == [1, 1, 0]
+    # Wilson's interval for 2 of 4.
     assert table(trials) == "| terrain | p |\n| --- | --- |\n| t | 50 (15-85) |"
 
 
 def test_cost_by_hand():
-    cost = Cost(maps=1000, episodes=300_000, seconds=36_000)
-    assert "1,000 maps" in cost.on(4) and "2.5 h on 4 cores" in cost.on(4)
-    assert "37.5 min on 16 cores" in cost.on(16)
+    cost = Cost(work="1,000 maps, at most", seconds=36_000)
+    assert cost.on(1) == "1,000 maps, at most about 10.0 h on 1 core like this one"
+    assert "2.5 h on 4 cores" in cost.on(4) and "38 min on 16 cores" in cost.on(16)
+    # Five parts of an hour each take two cores three hours, and eight cores one.
+    cost = Cost(work="5 trainings, at least", seconds=5 * 3600, parts=5)
+    assert "about 3.0 h on 2 cores" in cost.on(2) and "about 60 min on 8 cores" in cost.on(8)
 
 
 def test_wrong_names_are_refused_before_anything_runs(config):
     with pytest.raises(TerrainError, match="moon"):
-        evaluate(replace(config, terrains=("flat", "moon")))
-    with pytest.raises(ConfigError, match="wings"):
-        evaluate(replace(config, policies=("wings",)))
+        run(replace(config, terrains=("flat", "moon")))
+    with pytest.raises(ConfigError, match="policy named wings"):
+        run(replace(config, policies=("wings",)))
     with pytest.raises(ConfigError, match="trials"):
         MatrixConfig(trials=0)
     with pytest.raises(ConfigError, match="planner named wings"):
-        ablation.evaluate(AblationConfig(planners=("wings",), zoo=config.zoo))
+        ablation.run(AblationConfig(planners=("wings",), zoo=config.zoo))
 
 
 def test_policies_come_in_the_tables_order(config, make_rolling):
     zoo = {name: make_rolling(name) for name in ("general", "steps", "gaps")}
     assert policies(config, zoo) == ("steps", "gaps", "ours", "general")
     assert policies(replace(config, policies=("ours", "gaps")), zoo) == ("gaps", "ours")
-
-
-def test_rows_that_cannot_be_written_are_reported_before_the_work(config):
-    (config.zoo.parent / "file").write_text("in the way")
-    with pytest.raises(StorageError, match="file"):
-        run(replace(config, json=config.zoo.parent / "file" / "rows.json"))
 
 
 @pytest.mark.slow
@@ -238,8 +265,9 @@ def test_the_ablation_has_a_line_a_planner(zoo, capsys):
     ]  # fmt: skip
     # gaps refuses (f = 0.05 < f_min); all others find flat ground easy, with nothing to switch to.
     assert "| gaps | 0 (0-66) | 2 | 0 | 0 | - | - |" in printed
-    rows = {row["policy"]: row for row in ablation.evaluate(config)}  # from the folder
-    assert [rows[name]["successes"] for name in ("ours", "no-fusion", "occupancy+P")] == [2, 2, 2]
+    cells = by_cell(rows_in(config.out), ("policy",))
+    for name in ("ours", "no-fusion", "occupancy+P"):
+        assert Share.reached(cells[name,]) == Share(successes=2, trials=2)
     assert "22 trials in all" in (config.out / "table.md").read_text()
 
 

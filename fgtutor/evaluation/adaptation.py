@@ -10,7 +10,7 @@ and against `geodesic`, the shortest way over cells that are no wall.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,14 +22,15 @@ from annotated_types import Interval
 from jaxtyping import Float
 from torch import Tensor
 
+from fgtutor.baselines import single
+from fgtutor.directions import NUM_HEADINGS
 from fgtutor.errors import TerrainError
 from fgtutor.evaluation.cost import Cost, estimate
-from fgtutor.evaluation.planned import PlannedConfig
 from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
 from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.success import terrain_seed
-from fgtutor.evaluation.tasks import Row, Task
-from fgtutor.execution import execute_batch
+from fgtutor.evaluation.tasks import Task
+from fgtutor.evaluation.trials import Ground, Outcome, PlannedConfig, by_cell, drive
 from fgtutor.figures.maps import draw_plans
 from fgtutor.io.validation import Count, check_arguments
 from fgtutor.io.validation import Share as Fraction
@@ -39,7 +40,7 @@ from fgtutor.routes import Route
 from fgtutor.specialist import ZOO, Specialist
 from fgtutor.statistics import Share, spl
 from fgtutor.world.obstacles import Course
-from fgtutor.world.terrain import Section, Terrain, TerrainSeed, rasterise
+from fgtutor.world.terrain import Section, Terrain, TerrainSeed, finish_course
 
 COMMAND = "evaluate adaptation"
 CHECKPOINTS = "_checkpoints"
@@ -120,18 +121,15 @@ def make_map(robot: str, seed: TerrainSeed, heights: Risers = AdaptationConfig.h
         _lay_flight(course, (x0, x1), (y0, y1), height * scale.step_height[1])
         gates.append(Section(name="steps", x0=x0, y0=y0, x1=x1, y1=y1))
         edge = y1
-    start, goal = (SIDE, BELOW), (SIDE + STRAIGHT, BELOW)
-    return Terrain(
+    return finish_course(
+        course,
         name="nested ways",
         robot=robot,
-        difficulty=1.0,
         seed=seed,
-        elevation=rasterise(course.boxes, (scale.length, width), scale.resolution),
-        boxes=tuple(course.boxes),
-        start=start,
-        goal=goal,
-        sections=tuple(gates),
-        lane=(start, goal),
+        length=scale.length,
+        start=(SIDE, BELOW),
+        goal=(SIDE + STRAIGHT, BELOW),
+        sections=gates,
     )
 
 
@@ -151,20 +149,11 @@ def geodesic(terrain: Terrain) -> float:
 
     It goes from cell to cell in eight headings, as routes do: no route is shorter.
     """
-    open_ = np.where(terrain.elevation.heights < WALL - 1e-3, 1.0, 0.0)
-    free = np.repeat(open_[..., None], 8, axis=-1)
-    return (
-        plan(
-            free,
-            np.zeros(free.shape, dtype=int),
-            grid=terrain.elevation,
-            start=terrain.start,
-            goal=terrain.goal,
-            cost="length",
-        )
-        .raise_for()
-        .length
-    )
+    open_ = terrain.elevation.heights < WALL - 1e-3
+    free = np.repeat(open_[..., None], NUM_HEADINGS, axis=-1).astype(float)
+    start, goal = terrain.start, terrain.goal
+    route = plan(free, 0 * free, grid=terrain.elevation, start=start, goal=goal)
+    return route.raise_for().length
 
 
 def way_of(xy: Float[np.ndarray, "n 2"], terrain: Terrain) -> str | None:
@@ -181,49 +170,48 @@ def find_plans(
     terrain: Terrain, zoo: Mapping[str, Specialist], config: AdaptationConfig
 ) -> dict[str, tuple[Float[Tensor, "nx ny 8"], Route | None]]:
     """Return each checkpoint's tensor on a map and its route, None where there is no way for it."""
-    plans = {}
+    ends, plans = (terrain.start, terrain.goal), {}
     for name, specialist in zoo.items():
-        plan = plan_on_map(
-            terrain.elevation,
-            {name: specialist},
-            terrain.start,
-            terrain.goal,
-            settings=config.planning,
-        )
+        plan = plan_on_map(terrain.elevation, {name: specialist}, *ends, settings=config.planning)
         plans[name] = plan.fused, plan.answer or None
     return plans
 
 
-def run_task(config: AdaptationConfig, index: int) -> list[Row]:
+class AdaptationRow(Outcome):
+    """A trial of a checkpoint, as a report keeps it."""
+
+    length: float
+    """Distance driven, m."""
+    way: str | None
+    """The way that was planned, one of `WAYS`."""
+    planned: float | None
+    """The route's length, m."""
+    straight: float
+    """The length of the straight line, m."""
+    geodesic: float
+    """The length of the shortest way over no wall, m."""
+
+
+def run_task(config: AdaptationConfig, index: int) -> list[AdaptationRow]:
     """Do one task: all trials of all checkpoints on one map."""
-    zoo, seeds = config.load_checkpoints(), config.seeds(index)
     terrain = make_map(config.robot, terrain_seed(config.seed, index), config.heights)
     shortest = round(geodesic(terrain), 3)
+    ground, zoo = Ground(terrain=terrain, seeds=config.seeds(index)), config.load_checkpoints()
+    planners = {name: partial(single, name) for name in zoo}
     return [
         {
-            "policy": name,
+            "policy": trial.policy,
             "ground": terrain.seed,
-            "seed": seed,
-            **outcome,
+            "seed": trial.seed,
+            "outcome": trial.outcome,
+            "length": trial.length,
+            "way": way_of(trial.route.xy, terrain) if trial.route else None,
+            "planned": round(trial.route.length, 3) if trial.route else None,
             "straight": STRAIGHT,
             "geodesic": shortest,
         }
-        for name, (_, route) in find_plans(terrain, zoo, config).items()
-        for seed, outcome in zip(seeds, _drive(route, terrain, zoo[name], seeds), strict=True)
+        for trial in drive([ground], planners, zoo, settings=config.planning)
     ]
-
-
-def _drive(
-    route: Route | None, terrain: Terrain, specialist: Specialist, seeds: Sequence[int]
-) -> list[Row]:
-    """Drive a route once a seed, all at once; lengths in m."""
-    n = len(seeds)
-    if route is None:
-        return [{"outcome": "no_route", "length": 0.0, "way": None, "planned": None}] * n
-    planned = {"way": way_of(route.xy, terrain), "planned": round(route.length, 3)}
-    team = {specialist.name: specialist}
-    episodes = execute_batch([route] * n, [terrain] * n, team, seeds=seeds)
-    return [{"outcome": e.reason, "length": round(e.length, 3), **planned} for e in episodes]
 
 
 def make_tasks(config: AdaptationConfig) -> list[Task]:
@@ -234,75 +222,65 @@ def make_tasks(config: AdaptationConfig) -> list[Task]:
     ]
 
 
-def summarise(trials: Sequence[Row]) -> Row:
-    """Return what the trials of one checkpoint come to; the length is that of its successes.
+Interval95 = tuple[float, float, float]
+"""A mean and the ends of its 95 % interval."""
+
+
+def summarise(trials: Sequence[AdaptationRow]) -> dict[str, Interval95 | None]:
+    """Return the `length` of one checkpoint's successes, m, and its SPL, by reference.
 
     Intervals are bootstrapped over the maps: trials on one map resemble each other.
     """
-    maps: dict[int, list[Row]] = {}
-    for trial in trials:
-        maps.setdefault(trial["ground"], []).append(trial)
-    reached = [[t for t in group if t["outcome"] == "reached"] for group in maps.values()]
+    maps = by_cell(trials, ("ground",)).values()
+    reached = [[t["length"] for t in own if t["outcome"] == "reached"] for own in maps]
     return {
-        "policy": trials[0]["policy"],
-        "trials": len(trials),
-        "successes": sum(len(group) for group in reached),
-        "ways": [w for w in WAYS if any(t["way"] == w for t in trials)],
-        "length": _estimate(reached, lambda group: fmean(t["length"] for t in group)),
-        **{
-            f"spl_{reference}": _estimate(list(maps.values()), partial(_spl, reference=reference))
-            for reference in ("straight", "geodesic")
-        },
+        "length": bootstrap(reached),
+        "straight": bootstrap([[_spl(t, t["straight"]) for t in own] for own in maps]),
+        "geodesic": bootstrap([[_spl(t, t["geodesic"]) for t in own] for own in maps]),
     }
 
 
-def _spl(trials: Sequence[Row], reference: str) -> float:
-    success = np.array([trial["outcome"] == "reached" for trial in trials], dtype=float)
-    length, shortest = (np.array([t[key] for t in trials]) for key in ("length", reference))
-    return spl(success, length, shortest)
+def _spl(trial: AdaptationRow, reference: float) -> float:
+    return spl(np.array([trial["outcome"] == "reached"]), np.array([trial["length"]]), reference)
 
 
-def _estimate(
-    groups: Sequence[Sequence[Row]], mean: Callable[[Sequence[Row]], float]
-) -> tuple[float, float, float] | None:
-    """Return a mean of all trials and its 95 % interval, from groups of trials drawn anew."""
+def bootstrap(groups: Iterable[Sequence[float]]) -> Interval95 | None:
+    """Return the mean of all values and its interval, from groups drawn anew; None of no value."""
     groups = [group for group in groups if group]
     if not groups:
         return None
-    value = mean([trial for group in groups for trial in group])
-    means, sizes = np.array([mean(group) for group in groups]), np.array([len(g) for g in groups])
+    means, sizes = np.array([(fmean(group), len(group)) for group in groups]).T
     drawn = np.random.default_rng(0).integers(len(groups), size=(RESAMPLES, len(groups)))
     resampled = (means * sizes)[drawn].sum(axis=1) / sizes[drawn].sum(axis=1)
     low, high = np.percentile(resampled, (2.5, 97.5)).tolist()
-    return value, low, high
+    return fmean(value for group in groups for value in group), low, high
 
 
-def summaries(trials: Sequence[Row], checkpoints: Sequence[str]) -> list[Row]:
-    """Return one summary a checkpoint."""
-    return [summarise([t for t in trials if t["policy"] == name]) for name in checkpoints]
+def table(trials: Sequence[AdaptationRow], zoo: Mapping[str, Specialist]) -> str:
+    """Return the trials as a Markdown table, a line per checkpoint of the zoo.
 
+    A dash stands where nothing was reached.
+    """
 
-def table(rows: Sequence[Row], zoo: Mapping[str, Specialist]) -> str:
-    """Return the summaries as a Markdown table; a dash stands where nothing was reached."""
+    def write(mean: Interval95 | None, digits: int) -> str:
+        value, low, high = (f"{number:.{digits}f}" for number in mean or (0.0,) * 3)
+        return f"{value} ({low}-{high})" if mean else "-"
 
-    def write(estimate: tuple[float, float, float] | None, digits: int) -> str:
-        if estimate is None:
-            return "-"
-        value, low, high = (f"{number:.{digits}f}" for number in estimate)
-        return f"{value} ({low}-{high})"
-
-    lines = [
-        [
-            row["policy"],
-            f"{zoo[row['policy']].provenance.get('samples', 0):,}",
-            ", ".join(row["ways"]) or "none",
-            write(row["length"], 2),
-            Share(successes=row["successes"], trials=row["trials"]),
-            write(row["spl_straight"], 3),
-            write(row["spl_geodesic"], 3),
-        ]
-        for row in rows
-    ]
+    cells, lines = by_cell(trials, ("policy",)), []
+    for name, specialist in zoo.items():
+        own = cells[name,]
+        mean, taken = summarise(own), {trial["way"] for trial in own}
+        lines.append(
+            [
+                name,
+                f"{specialist.provenance.get('samples', 0):,}",
+                ", ".join(way for way in WAYS if way in taken) or "none",
+                write(mean["length"], 2),
+                Share.reached(own),
+                write(mean["straight"], 3),
+                write(mean["geodesic"], 3),
+            ]
+        )
     columns = "checkpoint, samples, way, length (m), success (%), SPL straight, SPL geodesic"
     return markdown(columns.split(", "), lines)
 
@@ -313,21 +291,16 @@ def run(config: AdaptationConfig) -> int:
     first = make_map(config.robot, terrain_seed(config.seed, 0), config.heights)
 
     def cost() -> Cost:
-        # The estimate takes the straight line for the length of a trial.
-        detour, trials = fmean(LENGTHS) / STRAIGHT, config.trials * len(zoo)
-        driven = estimate(zoo, [first], grounds=len(tasks), episodes=round(trials * detour))
-        return replace(driven, episodes=trials)
+        detour, episodes = fmean(LENGTHS) / STRAIGHT, config.trials * len(zoo)
+        return estimate(zoo, [first], grounds=len(tasks), episodes=episodes, detour=detour)
 
-    def find(trials: list[Row]) -> Findings:
+    def find(trials: list[AdaptationRow]) -> Findings:
         return Findings(
-            table=table(summaries(trials, list(zoo)), zoo),
-            caption=(
-                f"{config.trials:,} trials a checkpoint on {len(tasks)} maps, with 95 % intervals; "
-                f"robot {config.robot}, {config.planning}, seed {config.seed}. SPL against the "
-                f"straight line of "
-                f"{STRAIGHT:g} m, as the paper's numbers imply, and against the shortest way over "
-                f"no wall, {geodesic(first):.1f} m."
-            ),
+            table=table(trials, zoo),
+            caption=f"{config.trials:,} trials a checkpoint on {len(tasks)} maps, with 95 % "
+            f"intervals; robot {config.robot}, {config.planning}, seed {config.seed}. SPL against "
+            f"the straight line of {STRAIGHT:g} m, as the paper's numbers imply, and against the "
+            f"shortest way over no wall, {geodesic(first):.1f} m.",
             figures=figures(first, zoo, config) if config.out else {},
         )
 

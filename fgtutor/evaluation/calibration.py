@@ -6,52 +6,51 @@ and w_ood on what it met at home with w_ood on what the other specialists meet a
 Source: paper, Sec. III-A (feasibility is predicted r_v) and Eq. 4.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, TypedDict
 
 import numpy as np
 import torch
 from annotated_types import Interval
 from jaxtyping import Float
 from torch import Tensor
-from tqdm import tqdm
 
 from fgtutor.errors import ConfigError
+from fgtutor.evaluation.report import Findings, markdown, run_and_report
+from fgtutor.evaluation.shards import settings_of
+from fgtutor.evaluation.tasks import Task
+from fgtutor.evaluation.trials import ZooConfig
 from fgtutor.feasibility import feasibility_labels, ood_weight
-from fgtutor.io.storage import check_writable, write_json
-from fgtutor.io.validation import NonNegative, Seed, check_fields
+from fgtutor.io.validation import NonNegative
 from fgtutor.robots import env_class
+from fgtutor.settings import SETTINGS
 from fgtutor.specialist import Specialist, load_zoo
 from fgtutor.statistics import calibration
 from fgtutor.tensorization import resolve_taus
 from fgtutor.world.terrain import World, make_terrain
 
+COMMAND = "evaluate calibration"
+
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrationConfig:
+class CalibrationConfig(ZooConfig):
     """Check every Feasibility-Net on terrain that was never trained on."""
 
-    robot: str = "toy"
-    """Which robot."""
     envs: Annotated[int, Interval(ge=1, le=10_000)] = 100
     """Robots, each on a terrain of its own."""
     seconds: Annotated[float, Interval(gt=0, le=3600)] = 16.0
     """How long they drive, s; ended episodes begin anew."""
-    seed: Seed = 0
-    """What terrains and episodes are drawn from."""
-    taus: Literal["paper", "calibrated"] = "calibrated"
-    """Thresholds of w_ood."""
+    settings: Literal["ours", "paper"] = "ours"
+    """Whose thresholds of w_ood: ours, or the paper's."""
+    taus: Literal["paper", "calibrated"] | None = None
+    """Other thresholds than those of the settings."""
     relief: NonNegative = 0.06
     """A patch with at least this difference of heights is distinctive of its terrain, m."""
-    zoo: Path | None = None
-    """Folder of specialist folders; default: the shipped zoo."""
-    json: Path | None = None
-    """Write the results here."""
 
-    def __post_init__(self) -> None:
-        check_fields(self)
+    def load_zoo(self) -> dict[str, Specialist]:
+        """Return the specialists."""
+        return load_zoo(self.robot, self.home)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +63,20 @@ class Drive:
     """Its Feasibility-Net's f there."""
     measured: Float[np.ndarray, "n"]
     """The mean r_v that followed."""
+
+
+class CalibrationRow(TypedDict):
+    """What a report keeps of one specialist's drive."""
+
+    specialist: str
+    samples: int
+    """Labelled patches."""
+    calibration_error: float
+    calibration: list[list[float | None]]
+    """Mean predicted, mean measured and count of each bin."""
+    w_ood: dict[str, float | None]
+    """What every Feasibility-Net of the zoo makes of the patches: the driver's own of all of them,
+    the others of the distinctive ones, of which flat ground has none."""
 
 
 @torch.no_grad()
@@ -94,83 +107,67 @@ def drive(specialist: Specialist, terrain: str, config: CalibrationConfig) -> Dr
     return Drive(patch, predicted.numpy(), label[valid].numpy())
 
 
-def evaluate(config: CalibrationConfig, *, progress: bool = False) -> dict[str, Any]:
-    """Return, by specialist: calibration, w_ood at home and at the others' obstacles."""
-    zoo = load_zoo(config.robot, config.zoo)
-    if not zoo:
-        raise ConfigError("there is no specialist to check: the zoo is empty")
-    drives = {
-        name: drive(specialist, specialist.provenance.get("terrain", name), config)
-        for name, specialist in tqdm(zoo.items(), disable=not progress, unit="specialist")
-    }
-    return {name: _check(name, zoo, drives, config) for name in zoo}
+def run_task(config: CalibrationConfig, name: str) -> list[CalibrationRow]:
+    """Do one task: drive one specialist, and ask the Feasibility-Nets of all about what it met."""
+    zoo = config.load_zoo()
+    taus = config.taus or SETTINGS[config.settings].taus
+    driven = drive(zoo[name], zoo[name].provenance.get("terrain", name), config)
+    relief = driven.patch.amax(dim=-1) - driven.patch.amin(dim=-1)
+    distinctive = driven.patch[relief >= config.relief]
 
-
-def _check(
-    name: str,
-    zoo: Mapping[str, Specialist],
-    drives: Mapping[str, Drive],
-    config: CalibrationConfig,
-) -> dict[str, Any]:
-    specialist, own = zoo[name], drives[name]
-    table, error = calibration(own.predicted, own.measured)
-    taus = resolve_taus(config.taus, specialist)
-
-    def weight(patch: Tensor) -> float | None:
-        if not len(patch):  # flat ground has nothing distinctive
+    def weight(other: str) -> float | None:
+        patch = driven.patch if other == name else distinctive
+        if not len(patch):
             return None
         with torch.inference_mode():
-            loss = specialist.feasibility.reconstruction(patch)
-        return round(ood_weight(loss, *taus).mean().item(), 4)
+            loss = zoo[other].feasibility.reconstruction(patch)
+        return round(ood_weight(loss, *resolve_taus(taus, zoo[other])).mean().item(), 4)
 
-    return {
-        "samples": len(own.measured),
-        "calibration_error": round(error, 4),
-        "calibration": [
-            [None if np.isnan(v) else round(float(v), 4) for v in row] for row in table
-        ],
-        "taus": [round(tau, 4) for tau in taus],
-        "w_ood_own": weight(own.patch),
-        "w_ood_others": {
-            other: weight(_distinctive(drive.patch, config.relief))
-            for other, drive in drives.items()
-            if other != name
-        },
-    }
-
-
-def _distinctive(patch: Float[Tensor, "n points"], relief: float) -> Float[Tensor, "m points"]:
-    return patch[patch.amax(dim=-1) - patch.amin(dim=-1) >= relief]
-
-
-def report(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the results as a Markdown table."""
-    names = list(results)
-    lines = [
-        "| specialist | calibration error | w_ood own | "
-        + " | ".join(f"w_ood {name}" for name in names)
-        + " |",
-        "|---" * (len(names) + 3) + "|",
+    bins, error = calibration(driven.predicted, driven.measured)
+    return [
+        {
+            "specialist": name,
+            "samples": len(driven.measured),
+            "calibration_error": round(error, 4),
+            "calibration": [[None if np.isnan(v) else round(float(v), 4) for v in b] for b in bins],
+            "w_ood": {other: weight(other) for other in zoo},
+        }
     ]
-    for name, row in results.items():
-        others = [row["w_ood_others"].get(o) for o in names]
-        lines.append(
-            f"| {name} | {row['calibration_error']:.3f} | {row['w_ood_own']:.2f} | "
-            + " | ".join("-" if w is None else f"{w:.2f}" for w in others)
-            + " |"
-        )
-    return "\n".join(lines)
+
+
+def table(rows: Sequence[CalibrationRow]) -> str:
+    """Return the rows as a Markdown table: a line per Feasibility-Net, w_ood by who drove."""
+
+    def write(weight: float | None) -> str:
+        return "-" if weight is None else f"{weight:.2f}"
+
+    lines = []
+    for row in rows:
+        own, asked = row["specialist"], {row["specialist"]: row["w_ood"] for row in rows}
+        others = (write(None if own == name else asked[name][own]) for name in asked)
+        lines.append([own, f"{row['calibration_error']:.3f}", write(asked[own][own]), *others])
+    names = (f"w_ood {row['specialist']}" for row in rows)
+    return markdown(["specialist", "calibration error", "w_ood own", *names], lines)
 
 
 def run(config: CalibrationConfig) -> int:
-    """Check from the command line, print the table and write the results."""
-    if config.json:
-        check_writable(config.json)
-    results = evaluate(config, progress=True)
-    print(report(results))
-    samples = min(row["samples"] for row in results.values())
-    print(f"at least {samples:,} labelled patches each, tau {config.taus}, seed {config.seed}")
-    if config.json:
-        write_json(config.json, results)
-        print(f"results -> {config.json}")
-    return 0
+    """Check from the command line, print the table and write the report."""
+    names = list(config.load_zoo())
+    if not names:
+        raise ConfigError("there is no specialist to check: the zoo is empty")
+
+    def find(rows: list[CalibrationRow]) -> Findings:
+        samples = min(row["samples"] for row in rows)
+        caption = (
+            f"At least {samples:,} labelled patches each; robot {config.robot}, tau "
+            f"{config.taus or SETTINGS[config.settings].taus}, seed {config.seed}."
+        )
+        return Findings(table=table(rows), caption=caption)
+
+    return run_and_report(
+        config,
+        title=f"What Feasibility-Nets know ({config.robot})",
+        tasks=[Task(name=name, function=run_task, arguments=(config, name)) for name in names],
+        settings=settings_of(config, COMMAND, zoo=config.zoo_digests()),
+        find=find,
+    )

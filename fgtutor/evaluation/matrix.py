@@ -1,23 +1,22 @@
 """Table II: success of every policy, of ours and of the generalist on every terrain.
 
 Reads a robot, a number of trials and a seed; gives rows with confidence intervals and the reason of
-every failure. Source: paper, Sec. IV-B (Table II); `--protocol paper` is its 40 tasks a terrain
+every failure. Source: paper, Sec. IV-B (Table II); `--protocol paper` is its 40 tasks per terrain
 with 250 trials each, 300,000 trials with four specialists.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 from fgtutor.baselines import OURS
-from fgtutor.errors import ConfigError
 from fgtutor.evaluation import success
 from fgtutor.evaluation.report import markdown
-from fgtutor.evaluation.success import TrialsConfig, by_cell
-from fgtutor.evaluation.tasks import Row
+from fgtutor.evaluation.success import TrialsConfig
+from fgtutor.evaluation.trials import TrialRow, by_cell, choose
 from fgtutor.io.validation import Unique
 from fgtutor.robots import ROBOTS
-from fgtutor.specialist import GENERAL, Specialist
+from fgtutor.specialist import GENERAL
 from fgtutor.statistics import Share
 
 COMMAND = "evaluate matrix"
@@ -33,45 +32,29 @@ class MatrixConfig(TrialsConfig):
     """Only these policies; default: each specialist, ours, general."""
 
 
-def policies(config: MatrixConfig, zoo: Mapping[str, Specialist]) -> tuple[str, ...]:
+def policies(config: MatrixConfig, zoo: Iterable[str]) -> tuple[str, ...]:
     """Return the policies to evaluate, in the table's order; raises `ConfigError` for others."""
-    everyone = (*(name for name in zoo if name != GENERAL), OURS, *([GENERAL] * (GENERAL in zoo)))
-    unknown = [name for name in config.policies if name not in everyone]
-    if unknown:
-        raise ConfigError(f"no policy named {', '.join(unknown)}; choose of {', '.join(everyone)}")
-    return tuple(name for name in everyone if not config.policies or name in config.policies)
+    known = [*(name for name in zoo if name != GENERAL), OURS]
+    return choose("policy", config.policies, [*known, GENERAL] if GENERAL in zoo else known)
 
 
-def terrains(config: MatrixConfig) -> tuple[str, ...]:
-    """Return the terrains to evaluate on."""
-    return config.terrains or (*ROBOTS[config.robot].scale.mixed, "mixed")
-
-
-def evaluate(config: MatrixConfig) -> list[Row]:
-    """Return the rows of the matrix; the same for any number of workers."""
-    return success.evaluate(config, COMMAND, terrains(config), policies(config, config.load_zoo()))
-
-
-def table(trials: Sequence[Row]) -> str:
-    """Return the trials as a Markdown table: a line a terrain, a column a policy."""
+def table(trials: Sequence[TrialRow]) -> str:
+    """Return the trials as a Markdown table: a line per terrain, a column per policy."""
     cells = by_cell(trials)
-    columns = dict.fromkeys(policy for _, policy in cells)
+    terrains, columns = (list(dict.fromkeys(names)) for names in zip(*cells, strict=True))
     return markdown(
         ["terrain", *columns],
-        (
-            [terrain, *(Share.reached(cells[terrain, policy]) for policy in columns)]
-            for terrain in dict.fromkeys(terrain for terrain, _ in cells)
-        ),
+        ([name, *(Share.reached(cells[name, policy]) for policy in columns)] for name in terrains),
     )
 
 
 def run(config: MatrixConfig) -> int:
-    """Evaluate from the command line, print the table and write rows and report."""
+    """Evaluate from the command line, print the table and write the report."""
     return success.run_and_report(
         config,
         COMMAND,
         title=f"Success of policies on terrains ({config.robot})",
-        terrains=terrains(config),
+        terrains=config.terrains or (*ROBOTS[config.robot].scale.mixed, "mixed"),
         policies=policies(config, config.load_zoo()),
         table=table,
     )

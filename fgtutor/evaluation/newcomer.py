@@ -2,25 +2,24 @@
 
 Reads a zoo that holds the newcomer, and the terrain that it is for; gives our success there and on
 the other terrains without and with the newcomer's folder, on the same grounds. Nothing is trained.
-On every ground the tensors of the others are compared, bit for bit.
+On every ground the tensors of the other specialists are compared, bit for bit.
 Source: paper, Sec. III-C: F_max is a maximum over specialists, so one more only adds to it.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
 
-from fgtutor.baselines import AssessedMap, Layers, ours
+from fgtutor.baselines import AssessedMap, ours
 from fgtutor.errors import ConfigError, EvaluationError
 from fgtutor.evaluation import success
 from fgtutor.evaluation.report import markdown
 from fgtutor.evaluation.shards import digest
-from fgtutor.evaluation.success import TrialsConfig, by_cell, make_ground, summarise
-from fgtutor.evaluation.tasks import Row
-from fgtutor.evaluation.trials import drive
+from fgtutor.evaluation.success import TrialsConfig, make_ground
+from fgtutor.evaluation.trials import TrialRow, by_cell, drive, failures
 from fgtutor.io.validation import Unique
 from fgtutor.robots import ROBOTS
 from fgtutor.specialist import DESCRIPTION, GENERAL, Specialist, load_specialist, load_zoo
@@ -52,11 +51,8 @@ class NewcomerConfig(TrialsConfig):
     @property
     def name(self) -> str:
         """What the newcomer is called; in the zoo, as its folder."""
-        return (
-            self.folder.name
-            if self.folder in super().folders
-            else load_specialist(self.folder).name
-        )
+        inside = self.folder in super().folders
+        return self.folder.name if inside else load_specialist(self.folder).name
 
     @property
     def folders(self) -> list[Path]:
@@ -67,6 +63,13 @@ class NewcomerConfig(TrialsConfig):
         """Return the zoo with the newcomer."""
         *_, zoo = zoos(self)
         return zoo
+
+
+class NewcomerRow(TrialRow):
+    """A trial, with what was planned on."""
+
+    tensors: dict[str, str]
+    """A digest of each specialist's tensor."""
 
 
 def terrains(config: NewcomerConfig) -> tuple[str, ...]:
@@ -107,79 +110,69 @@ def zoos(config: NewcomerConfig) -> Iterator[dict[str, Specialist]]:
 
 def run_task(
     config: NewcomerConfig, terrain: str, stages: Sequence[str], indices: Sequence[int]
-) -> list[Row]:
+) -> list[NewcomerRow]:
     """Do one task: some grounds of one terrain, without and with the newcomer."""
     grounds = [make_ground(config, terrain, index) for index in indices]
-    rows: list[Row] = []
+    rows: list[NewcomerRow] = []
     for stage, zoo in zip(stages, zoos(config), strict=True):
-        digests: list[dict[str, str]] = []
-        trials = drive(
-            grounds,
-            {stage: partial(_ours_noted, digests)},
-            zoo,
-            settings=config.planning,
-        )
-        # Planned in the order of the grounds, once each.
-        noted = {g.terrain.seed: d for g, d in zip(grounds, digests, strict=True)}
-        rows += ({**asdict(trial), "tensors": noted[trial.ground]} for trial in trials)
+        digests: dict[int, dict[str, str]] = {}
+        for trial in drive(grounds, {stage: ours}, zoo, settings=config.planning):
+            row = trial.row
+            if row["ground"] not in digests:
+                digests[row["ground"]] = digests_of(trial.planned.known)
+            rows.append({**row, "tensors": digests[row["ground"]]})
     return rows
 
 
-def _ours_noted(digests: list[dict[str, str]], ground: AssessedMap) -> Sequence[Layers]:
-    """Plan as ours does, and note a digest of each tensor that is planned on."""
-    (layers,) = ours(ground)
-    digests.append(
-        {name: digest(tensor.contiguous().numpy().tobytes()) for name, tensor in layers.items()}
-    )
-    return [layers]
+def digests_of(known: AssessedMap) -> dict[str, str]:
+    """Return a digest of each tensor that our planner plans on."""
+    (layers,) = ours(known)
+    return {name: digest(tensor.contiguous().numpy().tobytes()) for name, tensor in layers.items()}
 
 
-def compare_tensors(trials: Sequence[Row], newcomer: str) -> str:
-    """Say how many of the others' tensors were compared, on how many maps.
+def compare_tensors(trials: Sequence[NewcomerRow], newcomer: str) -> str:
+    """Say how many tensors of the other specialists were compared, on how many maps.
 
     Raises `EvaluationError` if one of them is not the same, bit for bit, with the newcomer there.
     """
-    tensors: dict[str, dict[tuple[str, int], dict[str, str]]] = {stage: {} for stage in STAGES}
-    for trial in trials:
-        tensors[trial["policy"]][trial["terrain"], trial["ground"]] = trial["tensors"]
-    before, after = (tensors[stage] for stage in STAGES)
-    compared = 0
-    for (terrain, ground), mine in before.items():
+    before, after = (
+        {(t["terrain"], t["ground"]): t["tensors"] for t in trials if t["policy"] == stage}
+        for stage in STAGES
+    )
+    for (terrain, ground), tensors in before.items():
         then = after[terrain, ground]
-        changed = [name for name, digest in mine.items() if then.get(name) != digest]
-        if changed:
+        if changed := [name for name, digest in tensors.items() if then.get(name) != digest]:
             raise EvaluationError(
                 f"on ground {ground} of {terrain}, {newcomer} changed the tensor of "
                 f"{', '.join(changed)}, which may depend on its own folder alone: look for what "
                 "else it reads; the rows are kept"
             )
-        compared += len(mine)
-    names = dict.fromkeys(name for digests in before.values() for name in digests)
+    names = dict.fromkeys(name for tensors in before.values() for name in tensors)
+    compared = sum(len(tensors) for tensors in before.values())
     return (
         f"The tensors of {', '.join(names)} are bit-identical without and with {newcomer} on all "
         f"{len(before):,} maps ({compared:,} pairs compared by sha256)."
     )
 
 
-def table(trials: Sequence[Row], newcomer: str) -> str:
-    """Return the trials as a Markdown table, a line a terrain, with failures by reason."""
+def table(trials: Sequence[TrialRow], newcomer: str) -> str:
+    """Return the trials as a Markdown table, a line per terrain, with failures by reason."""
     cells = by_cell(trials)
     lines = []
     for terrain in dict.fromkeys(terrain for terrain, _ in cells):
         line: list[object] = [terrain]
         for stage in STAGES:
-            row = summarise(cells[terrain, stage])
-            share = Share(successes=row["successes"], trials=row["trials"])
-            line += [share, " / ".join(str(count) for count in row["failures"].values())]
+            cell = cells[terrain, stage]
+            line += [Share.reached(cell), " / ".join(map(str, failures(cell)))]
         lines.append(line)
-    failures = "no route / fell / timeout"
+    reasons = "no route / fell / timeout"
     return markdown(
-        ["terrain", f"without {newcomer}, %", failures, f"with {newcomer}, %", failures], lines
+        ["terrain", f"without {newcomer}, %", reasons, f"with {newcomer}, %", reasons], lines
     )
 
 
 def run(config: NewcomerConfig) -> int:
-    """Evaluate from the command line, print the table and write rows and report."""
+    """Evaluate from the command line, print the table and write the report."""
     grounds = terrains(config)
     return success.run_and_report(
         config,

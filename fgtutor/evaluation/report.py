@@ -21,9 +21,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fgtutor.evaluation.cost import Estimate
+from fgtutor.evaluation.cost import Cost
 from fgtutor.evaluation.shards import Run, RunConfig, collect, finished
-from fgtutor.evaluation.tasks import Row, Task
+from fgtutor.evaluation.tasks import Task
 from fgtutor.io.machine import usable_cores
 from fgtutor.io.storage import atomic_write, locked_folder, make_folder, write_json
 
@@ -57,13 +57,14 @@ def run_and_report(
     title: str,
     tasks: Sequence[Task],
     settings: dict[str, Any],
-    cost: Callable[[], Estimate],
-    find: Callable[[list[Row]], Findings],
+    cost: Callable[[], Cost] | None = None,
+    find: Callable[[list[Any]], Findings],
     watched: AbstractContextManager[None] | None = None,
 ) -> int:
     """Say what an evaluation will cost, do what is left of it, print and keep what it found.
 
-    `watched` surrounds the tasks, to show more of them than how many are done.
+    `find` gets the rows that the tasks returned, in the order of the tasks; `watched` surrounds the
+    tasks, to show more of them than how many are done.
     Returns the exit status of its command, 0. Raises what `collect` and `write_report` raise.
     """
     began = time.time()
@@ -72,9 +73,8 @@ def run_and_report(
         if left:
             # How many cores a cluster will give is not known before it does.
             cores = 1 if config.ray else config.workers or usable_cores()
-            print(
-                f"{left} of {len(tasks)} tasks to do; all of them: {cost().on(cores)}", flush=True
-            )
+            takes = f"; all of them: {cost().on(cores)}" if cost else ""
+            print(f"{left} of {len(tasks)} tasks to do{takes}", flush=True)
         with watched or nullcontext():
             run = collect(tasks, settings, config, progress=True)
         found = find(run.rows)

@@ -5,10 +5,8 @@ Trial k of a terrain is the same ground, start and goal for all planners.
 Source: paper, Sec. IV-B: 40 tasks of 250 trials a terrain, failures by reason.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -17,15 +15,13 @@ from annotated_types import Interval
 from fgtutor.baselines import planners
 from fgtutor.evaluation import report
 from fgtutor.evaluation.cost import Cost, estimate
-from fgtutor.evaluation.planned import PlannedConfig
 from fgtutor.evaluation.report import Findings
-from fgtutor.evaluation.shards import collect, settings_of
+from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.tasks import Row, Task
-from fgtutor.evaluation.trials import Ground, drive
+from fgtutor.evaluation.trials import Ground, PlannedConfig, TrialRow, by_cell, drive
 from fgtutor.figures.charts import draw_shares
-from fgtutor.io.storage import check_writable, write_json
 from fgtutor.io.validation import Share as Fraction
-from fgtutor.statistics import Share, wilson_interval
+from fgtutor.statistics import Share
 from fgtutor.world.terrain import Terrain, make_terrain
 
 GROUNDS = 25
@@ -51,8 +47,6 @@ class TrialsConfig(PlannedConfig):
     goal each (mixed: its own) and crosses each 250 times."""
     difficulty: Fraction = 1.0
     """Difficulty of all terrains."""
-    json: Path | None = None
-    """Write the table's rows here."""
 
     @property
     def count(self) -> int:
@@ -87,31 +81,41 @@ def make_ground(config: TrialsConfig, terrain: str, index: int) -> Ground:
 def with_random_ends(terrain: Terrain, seed: int) -> Terrain:
     """Return the terrain with start and goal drawn anew, each on the flat ground at one end.
 
-    Which end the start is at is drawn too. Nobody stands at random in a chasm or on a wall.
+    Which end the start is at is drawn too. A random place might be in a chasm or on a wall.
     """
-    dice = np.random.default_rng((seed, 1))
+    rng = np.random.default_rng((seed, 1))
     (x0, y0, x1, y1), parts = terrain.elevation.extent, terrain.sections
     flats = ((x0, parts[0].x0), (parts[-1].x1, x1)) if parts else ((x0, x1), (x0, x1))
 
     def draw(low: float, high: float) -> float:
         room = max(high - low - 2 * CLEARANCE, 0.0)
-        return float((low + high) / 2 + room * (dice.random() - 0.5))
+        return float((low + high) / 2 + room * (rng.random() - 0.5))
 
     ends = [(draw(low, high), draw(y0, y1)) for low, high in flats]
-    if dice.random() < 0.5:
+    if rng.random() < 0.5:
         ends.reverse()
     return replace(terrain, start=ends[0], goal=ends[1])
+
+
+def run_task(
+    config: TrialsConfig, terrain: str, policies: Sequence[str], indices: Sequence[int]
+) -> list[TrialRow]:
+    """Do one task: some grounds of one terrain, all policies."""
+    zoo, grounds = config.load_zoo(), [make_ground(config, terrain, index) for index in indices]
+    known = planners(zoo)
+    asked = {name: known[name] for name in policies}
+    return [trial.row for trial in drive(grounds, asked, zoo, settings=config.planning)]
 
 
 def make_tasks(
     config: TrialsConfig,
     terrains: Sequence[str],
     policies: Sequence[str],
-    work: Callable[..., list[Row]] | None = None,
+    work: Callable[..., list[Any]],
 ) -> list[Task]:
     """Cut an evaluation into tasks; the cut depends on the trials only, never on the workers.
 
-    `work` does what `run_task` does by default, with the same arguments.
+    `work` does a task, with the arguments of `run_task`.
     """
     for name in terrains:  # an unknown name fails here, not in a worker an hour later
         make_terrain(name, robot=config.robot, difficulty=config.difficulty)
@@ -120,7 +124,7 @@ def make_tasks(
     return [
         Task(
             name=f"{terrain}-{grounds.start:05d}-{grounds.stop:05d}",
-            function=work or run_task,
+            function=work,
             arguments=(config, terrain, tuple(policies), grounds),
         )
         for terrain in terrains
@@ -134,57 +138,6 @@ def cut(count: int, size: int = GROUNDS) -> Iterator[range]:
         yield range(first, min(first + size, count))
 
 
-def run_task(
-    config: TrialsConfig, terrain: str, policies: Sequence[str], grounds: Sequence[int]
-) -> list[Row]:
-    """Do one task: some grounds of one terrain, all policies."""
-    zoo = config.load_zoo()
-    known = planners(zoo)
-    trials = drive(
-        [make_ground(config, terrain, index) for index in grounds],
-        {name: known[name] for name in policies},
-        zoo,
-        settings=config.planning,
-    )
-    return [asdict(trial) for trial in trials]
-
-
-def summarise(trials: Sequence[Row]) -> Row:
-    """Return the counts of trials that share terrain and policy."""
-    count = Counter(trial["outcome"] for trial in trials)
-    low, high = wilson_interval(count["reached"], len(trials))
-    return {
-        "terrain": trials[0]["terrain"],
-        "policy": trials[0]["policy"],
-        "trials": len(trials),
-        "successes": count["reached"],
-        "ci95": [round(low, 4), round(high, 4)],
-        "failures": {reason: count[reason] for reason in ("no_route", "fell", "timeout")},
-    }
-
-
-def by_cell(
-    trials: Sequence[Row], keys: Sequence[str] = ("terrain", "policy")
-) -> dict[tuple[Any, ...], list[Row]]:
-    """Sort trials by the values of `keys`, in the order in which these first appear."""
-    cells: dict[tuple[Any, ...], list[Row]] = {}
-    for trial in trials:
-        cells.setdefault(tuple(trial[key] for key in keys), []).append(trial)
-    return cells
-
-
-def evaluate(
-    config: TrialsConfig, command: str, terrains: Sequence[str], policies: Sequence[str]
-) -> list[Row]:
-    """Return a row for every terrain and policy; the same for any number of workers."""
-    run = collect(
-        make_tasks(config, terrains, policies),
-        _settings(config, command, terrains, policies),
-        config,
-    )
-    return _summaries(run.rows, terrains, policies)
-
-
 def run_and_report(
     config: TrialsConfig,
     command: str,
@@ -192,16 +145,14 @@ def run_and_report(
     title: str,
     terrains: Sequence[str],
     policies: Sequence[str],
-    table: Callable[[Sequence[Row]], str],
-    work: Callable[..., list[Row]] | None = None,
-    remark: Callable[[Sequence[Row]], str] | None = None,
+    table: Callable[[Sequence[Any]], str],
+    work: Callable[..., list[Any]] = run_task,
+    remark: Callable[[Sequence[Any]], str] | None = None,
 ) -> int:
-    """Estimate, evaluate, print the table (made of all trials) and write what was asked for.
+    """Estimate, evaluate, print the table (made of all trials) and write the report.
 
     `work` is as in `make_tasks`; a `remark` on all trials ends the caption.
     """
-    if config.json:
-        check_writable(config.json)
 
     def cost() -> Cost:
         return estimate(
@@ -212,59 +163,35 @@ def run_and_report(
         )
 
     def find(trials: list[Row]) -> Findings:
-        rows = _summaries(trials, terrains, policies)
-        if config.json:
-            write_json(config.json, rows)
-            print(f"rows -> {config.json}")
+        shares: dict[str, dict[str, Share]] = {}
+        for (terrain, policy), cell in by_cell(trials).items():
+            shares.setdefault(terrain, {})[policy] = Share.reached(cell)
         caption = (
             f"Success in % with 95 % intervals, {config.count:,} trials a cell; robot "
             f"{config.robot}, protocol {config.protocol}, {config.planning}, seed {config.seed}."
         )
-        chart = draw_shares(_shares(rows), title=title)
+        chart = draw_shares(shares, title=title)
         return Findings(
             table=table(trials),
             caption=f"{caption} {remark(trials)}" if remark else caption,
             figures={"success.svg": chart.savefig},
         )
 
+    # By the paper's protocol, their number says which trials a ground is for.
+    number = {"trials": config.count} if config.protocol == "paper" else {}
     return report.run_and_report(
         config,
         title=title,
         tasks=make_tasks(config, terrains, policies, work),
-        settings=_settings(config, command, terrains, policies),
+        settings=settings_of(
+            config,
+            command,
+            without=("trials",),
+            terrains=terrains,
+            policies=policies,
+            zoo=config.zoo_digests(),
+            **number,
+        ),
         cost=cost,
         find=find,
     )
-
-
-def _shares(rows: Sequence[Row]) -> dict[str, dict[str, Share]]:
-    """Return the rows' shares by terrain and policy."""
-    groups: dict[str, dict[str, Share]] = {}
-    for row in rows:
-        share = Share(successes=row["successes"], trials=row["trials"])
-        groups.setdefault(row["terrain"], {})[row["policy"]] = share
-    return groups
-
-
-def _settings(
-    config: TrialsConfig, command: str, terrains: Sequence[str], policies: Sequence[str]
-) -> dict[str, Any]:
-    # By the paper's protocol, their number says which trials a ground is for.
-    number = {"trials": config.count} if config.protocol == "paper" else {}
-    return settings_of(
-        config,
-        command,
-        without=("trials",),
-        terrains=terrains,
-        policies=policies,
-        zoo=config.zoo_digests(),
-        **number,
-    )
-
-
-def _summaries(
-    trials: Sequence[Row], terrains: Sequence[str], policies: Sequence[str]
-) -> list[Row]:
-    """Return one row a terrain and policy, in the order asked for."""
-    cells = by_cell(trials)
-    return [summarise(cells[terrain, policy]) for terrain in terrains for policy in policies]

@@ -8,40 +8,49 @@ simulation is not); it names imprecise localisation and free switching as what f
 """
 
 import time
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from statistics import fmean
-from typing import Annotated, TypeVar
+from typing import Annotated, NotRequired
 
 import numpy as np
 from annotated_types import Interval, MinLen
 
-from fgtutor.baselines import OURS, AssessedMap, Planner, find_route, ours, single
+from fgtutor.baselines import OURS, Planner, ours, single
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError, TerrainError
+from fgtutor.errors import TerrainError
 from fgtutor.evaluation.cost import Cost, estimate
-from fgtutor.evaluation.planned import PlannedConfig
 from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
 from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.success import cut, terrain_seed
-from fgtutor.evaluation.tasks import Row, Task
-from fgtutor.execution import FollowConfig, execute_batch
+from fgtutor.evaluation.tasks import Task
+from fgtutor.evaluation.trials import (
+    Ground,
+    Outcome,
+    Planned,
+    PlannedConfig,
+    Trial,
+    by_cell,
+    choose,
+    drive_plans,
+    failures,
+    mean_if_reached,
+    plan_all,
+)
+from fgtutor.execution import FollowConfig
 from fgtutor.figures.charts import draw_shares
-from fgtutor.io.validation import Count, Unique, check_arguments
+from fgtutor.io.validation import Count, Positive, Unique, check_arguments
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.robots import ROBOTS
 from fgtutor.robots.lidar import scan_terrain, survey
-from fgtutor.routes import Route
-from fgtutor.specialist import GENERAL, Specialist
+from fgtutor.settings import PlanSettings
+from fgtutor.specialist import GENERAL
 from fgtutor.statistics import Share
 from fgtutor.world.obstacles import OBSTACLES, Course
 from fgtutor.world.scanning import ScanConfig, map_points
-from fgtutor.world.terrain import Section, Terrain, TerrainSeed, rasterise
+from fgtutor.world.terrain import Section, Terrain, TerrainSeed, finish_course
 
-T = TypeVar("T")
 Error = Annotated[float, Interval(ge=0, le=10)]
 """How far off a fix is, m, or drifts, m per square root of a second."""
 Levels = Annotated[tuple[tuple[Error, Error], ...], MinLen(1), Unique]
@@ -71,55 +80,73 @@ class SwitchingConfig(PlannedConfig):
     """Only these planners; default: all."""
     difficulty: Fraction = 1.0
     """Difficulty of all terrains."""
+    switch_cost: Positive | None = None
+    """Cost of changing the policy, for the planners that heed it (default 1)."""
+    hold_steps: Count | None = None
+    """Control steps for which a policy is wanted before it takes over, for the planners with
+    hysteresis (default 3)."""
     scan_spacing: Annotated[float, Interval(ge=0.01, le=100)] = 0.2
     """Distance between two poses of the scanner, m."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Variant:
-    """A way to plan and to follow."""
-
-    planner: Planner
-    """Gives the layers to plan on."""
-    switch_cost: float = 0.0
-    """What a change of policy costs in planning."""
-    hold_steps: int = 1
-    """Control steps for which a policy must be wanted before it takes over."""
+    @property
+    def planning(self) -> PlanSettings:
+        """The settings with all of our additions, whichever of the two they start from."""
+        cost, hold = PlanSettings.switch_cost, PlanSettings.hold_steps
+        return replace(
+            super().planning,
+            switch_cost=self.switch_cost or cost,
+            hold_steps=self.hold_steps or hold,
+        )
 
 
-def variants(config: SwitchingConfig, zoo: Mapping[str, Specialist]) -> dict[str, Variant]:
+class SwitchingRow(Outcome):
+    """A trial on a course, as a report keeps it; without a route there is nothing to add."""
+
+    course: str
+    noise: float
+    """Standard deviation of a fix, m."""
+    drift: float
+    """Growth of the error, m per square root of a second."""
+    length: NotRequired[float]
+    """Distance driven, m."""
+    seconds: NotRequired[float]
+    """Simulated time, s."""
+    switches: NotRequired[int]
+    """Policy changes on the way."""
+    planned_switches: NotRequired[int]
+    """Policy changes of the route."""
+    end: NotRequired[list[float]]
+    """Where the robot was in the end, m."""
+
+
+def variants(
+    config: SwitchingConfig, zoo: Iterable[str]
+) -> dict[str, tuple[Planner, PlanSettings]]:
     """Return the ways to compare: the paper's, each of our additions alone, all, the generalist.
 
     The switch cost includes that both policies must be able to take the step, since the search
     does. Raises `ConfigError` for a name that is none of them.
     """
-    cost, hold = config.planning.switch_cost, config.planning.hold_steps
+    both = config.planning
+    free = replace(both, switch_cost=0.0, hold_steps=1)
     known = {
-        OURS: Variant(planner=ours),
-        "+ hysteresis": Variant(planner=ours, hold_steps=hold),
-        "+ both feasible": Variant(planner=ours, switch_cost=NEARLY_FREE),
-        "+ switch cost": Variant(planner=ours, switch_cost=cost),
-        "+ all": Variant(planner=ours, switch_cost=cost, hold_steps=hold),
+        OURS: (ours, free),
+        "+ hysteresis": (ours, replace(both, switch_cost=0.0)),
+        "+ both feasible": (ours, replace(free, switch_cost=NEARLY_FREE)),
+        "+ switch cost": (ours, replace(both, hold_steps=1)),
+        "+ all": (ours, both),
     }
     if GENERAL in zoo:
-        known[GENERAL] = Variant(planner=partial(single, GENERAL))
-    return _choose("planner", config.planners, known)
+        known[GENERAL] = (partial(single, GENERAL), free)
+    return {name: known[name] for name in choose("planner", config.planners, known)}
 
 
 def courses(config: SwitchingConfig) -> dict[str, tuple[str, ...]]:
     """Return the terrains of each course, in the paper's order; raises `ConfigError` for others."""
-    if config.robot not in ROBOTS:
-        raise ConfigError(f"no course for robot {config.robot!r}: choose of {', '.join(ROBOTS)}")
-    order = ROBOTS[config.robot].course
+    (robot,) = choose("robot", [config.robot], ROBOTS)
+    order = ROBOTS[robot].course
     known = {"-".join(pair): pair for pair in pairwise(order)} | {FULL: order}
-    return _choose("course", config.courses, known)
-
-
-def _choose(what: str, names: Sequence[str], known: Mapping[str, T]) -> dict[str, T]:
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise ConfigError(f"no {what} named {', '.join(unknown)}; choose of {', '.join(known)}")
-    return {name: value for name, value in known.items() if not names or name in names}
+    return {name: known[name] for name in choose("course", config.courses, known)}
 
 
 def lay_course(
@@ -149,18 +176,16 @@ def lay_course(
         x = x1
     length = course.snap(x + scale.apron)
     course.full(x, length)
-    start, goal = (scale.apron / 2, course.middle), (length - scale.apron / 2, course.middle)
-    return Terrain(
+    return finish_course(
+        course,
         name="-".join(kinds),
         robot=robot,
-        difficulty=difficulty,
         seed=seed,
-        elevation=rasterise(course.boxes, (length, course.width), scale.resolution),
-        boxes=tuple(course.boxes),
-        start=start,
-        goal=goal,
-        sections=tuple(sections),
-        lane=(start, *lane, goal),
+        length=length,
+        start=(scale.apron / 2, course.middle),
+        goal=(length - scale.apron / 2, course.middle),
+        sections=sections,
+        lane=lane,
     )
 
 
@@ -184,125 +209,75 @@ def make_tasks(config: SwitchingConfig) -> list[Task]:
     ]
 
 
-def run_task(config: SwitchingConfig, course: str, indices: Sequence[int]) -> list[Row]:
-    """Do one task: scan each ground once, plan once a variant, drive at every level of noise."""
+def run_task(config: SwitchingConfig, course: str, indices: Sequence[int]) -> list[SwitchingRow]:
+    """Do one task: scan each ground once, plan once per variant, drive at every level of noise."""
     zoo, kinds = config.load_zoo(), courses(config)[course]
-    grounds = [
-        lay_course(
-            kinds,
-            robot=config.robot,
-            difficulty=config.difficulty,
-            seed=terrain_seed(config.seed, index),
-        )
-        for index in indices
-    ]
-    maps = [
-        AssessedMap(
-            scan_map(ground, seed=ground.seed, spacing=config.scan_spacing),
-            zoo,
-            config.planning.taus,
-        )
-        for ground in grounds
-    ]
-    routes: dict[tuple[Planner, float], list[Route | None]] = {}
-    rows: list[Row] = []
-    for name, variant in variants(config, zoo).items():
-        how = variant.planner, variant.switch_cost
-        if how not in routes:
-            routes[how] = [
-                _route(ground, known, variant, config)
-                for ground, known in zip(grounds, maps, strict=True)
-            ]
-        for level in config.levels:
-            shared = {"course": course, "policy": name, "noise": level[0], "drift": level[1]}
-            follow = FollowConfig(
-                hold_steps=variant.hold_steps, position_noise=level[0], drift=level[1]
+    grounds = [make_ground(config, kinds, terrain_seed(config.seed, index)) for index in indices]
+    maps = [ground.assess(zoo, config.planning) for ground in grounds]
+    plans: dict[tuple[Planner, float], list[Planned]] = {}
+    rows: list[SwitchingRow] = []
+    for name, (planner, settings) in variants(config, zoo).items():
+        how = planner, settings.switch_cost
+        if how not in plans:
+            plans[how] = plan_all(planner, grounds, maps, settings)
+        for noise, drift in config.levels:
+            follow = FollowConfig(hold_steps=settings.hold_steps, position_noise=noise, drift=drift)
+            rows += (
+                _row(trial, course, noise, drift)
+                for trial in drive_plans(name, plans[how], zoo, follow)
             )
-            rows += (shared | row for row in _drive(routes[how], grounds, zoo, follow))
     return rows
 
 
-def _route(
-    ground: Terrain, known: AssessedMap, variant: Variant, config: SwitchingConfig
-) -> Route | None:
-    settings = replace(config.planning, switch_cost=variant.switch_cost)
-    answer = find_route(variant.planner, known, ground.start, ground.goal, settings)
-    return answer if isinstance(answer, Route) else None
+def make_ground(config: SwitchingConfig, kinds: Sequence[str], seed: int) -> Ground:
+    """Lay a course, and scan it: the scan is what planning sees."""
+    terrain = lay_course(kinds, robot=config.robot, difficulty=config.difficulty, seed=seed)
+    scan = scan_map(terrain, seed=seed, spacing=config.scan_spacing)
+    return Ground(terrain=terrain, seeds=(seed,), seen=scan)
 
 
-def _drive(
-    routes: Sequence[Route | None],
-    grounds: Sequence[Terrain],
-    zoo: Mapping[str, Specialist],
-    follow: FollowConfig,
-) -> list[Row]:
-    """Drive what was planned, all at once; one row a ground."""
-    planned = [(route, ground) for route, ground in zip(routes, grounds, strict=True) if route]
-    driven = {}
-    if planned:
-        way, where = zip(*planned, strict=True)
-        seeds = [ground.seed for ground in where]
-        episodes = execute_batch(way, where, zoo, seeds=seeds, config=follow)
-        driven = dict(zip(seeds, episodes, strict=True))
-    rows = []
-    for route, ground in zip(routes, grounds, strict=True):
-        row: Row = {"ground": ground.seed, "seed": ground.seed, "outcome": "no_route"}
-        if route:
-            episode = driven[ground.seed]
-            row |= {
-                "outcome": episode.reason,
-                "length": round(episode.length, 3),
-                "seconds": round(episode.seconds, 3),
-                "switches": episode.switches,
-                "planned_switches": route.switches,
-                "end": [round(value, 2) for value in episode.poses[-1, :2].tolist()],
-            }
-        rows.append(row)
-    return rows
+def _row(trial: Trial, course: str, noise: float, drift: float) -> SwitchingRow:
+    row: SwitchingRow = {
+        "course": course,
+        "policy": trial.policy,
+        "noise": noise,
+        "drift": drift,
+        "ground": trial.seed,
+        "seed": trial.seed,
+        "outcome": trial.outcome,
+    }
+    if trial.route and trial.episode:
+        row["length"] = trial.length
+        row["seconds"] = trial.row["seconds"]
+        row["switches"] = trial.episode.switches
+        row["planned_switches"] = trial.route.switches
+        row["end"] = [round(value, 2) for value in trial.episode.poses[-1, :2].tolist()]
+    return row
 
 
-def by_level(trials: Sequence[Row]) -> dict[tuple[float, float], dict[str, dict[str, list[Row]]]]:
-    """Sort trials by level of noise, planner and course, in the order in which they appear."""
-    levels: dict[tuple[float, float], dict[str, dict[str, list[Row]]]] = {}
-    for trial in trials:
-        planners = levels.setdefault((trial["noise"], trial["drift"]), {})
-        planners.setdefault(trial["policy"], {}).setdefault(trial["course"], []).append(trial)
-    return levels
-
-
-def table(trials: Sequence[Row]) -> str:
-    """Return the trials as a Markdown table: a line a level and planner, a column a course.
+def table(trials: Sequence[SwitchingRow]) -> str:
+    """Return the trials as a Markdown table: a line per level and planner, a column per course.
 
     The last columns count, over all courses, how trials failed and how often the policy changed.
     """
     names = list(dict.fromkeys(trial["course"] for trial in trials))
     lines = []
-    for (noise, drift), planners in by_level(trials).items():
-        for planner, cells in planners.items():
-            everything = [trial for cell in cells.values() for trial in cell]
-            failed = Counter(trial["outcome"] for trial in everything)
-            switches = [t["switches"] for t in everything if t["outcome"] == "reached"]
-            lines.append(
-                [
-                    f"{100 * noise:g} + {100 * drift:g}",
-                    planner,
-                    *(Share.reached(cells[name]) for name in names),
-                    *(failed[reason] for reason in ("no_route", "fell", "timeout")),
-                    f"{fmean(switches):.1f}" if switches else "-",
-                ]
-            )
+    for (noise, drift, planner), own in by_cell(trials, ("noise", "drift", "policy")).items():
+        cells = by_cell(own, ("course",))
+        shares = [Share.reached(cells[name,]) for name in names]
+        level = f"{100 * noise:g} + {100 * drift:g}"
+        lines.append([level, planner, *shares, *failures(own), mean_if_reached(own, "switches")])
     columns = ["noise + drift", "planner", *names, "no route", "fell", "timeout", "switches"]
     return markdown(columns, lines)
 
 
-def charts(trials: Sequence[Row]) -> dict[str, Draw]:
-    """Return a chart a level: planners within courses."""
+def charts(trials: Sequence[SwitchingRow]) -> dict[str, Draw]:
+    """Return a chart per level: planners within courses."""
     figures: dict[str, Draw] = {}
-    for (noise, drift), planners in by_level(trials).items():
-        groups = {
-            course: {planner: Share.reached(cells[course]) for planner, cells in planners.items()}
-            for course in dict.fromkeys(trial["course"] for trial in trials)
-        }
+    for (noise, drift), level in by_cell(trials, ("noise", "drift")).items():
+        groups: dict[str, dict[str, Share]] = {}
+        for (course, planner), cell in by_cell(level, ("course", "policy")).items():
+            groups.setdefault(course, {})[planner] = Share.reached(cell)
         title = f"Fixes off by {100 * noise:g} cm, drift {100 * drift:g} cm per root second"
         chart = draw_shares(groups, title=title)
         name = f"success-{100 * noise:g}-{100 * drift:g}.svg"
@@ -322,7 +297,7 @@ def run(config: SwitchingConfig) -> int:
         scanned = config.trials * _scan_seconds(grounds, config.scan_spacing)
         return replace(driven, seconds=driven.seconds + scanned)
 
-    def find(trials: list[Row]) -> Findings:
+    def find(trials: list[SwitchingRow]) -> Findings:
         return Findings(
             table=table(trials),
             caption=(

@@ -47,7 +47,7 @@ class Task:
 
     name: str
     """Unlike any other task's; it names the file that keeps the rows."""
-    function: Callable[..., list[Row]]
+    function: Callable[..., list[Any]]
     """Computes the rows from the arguments alone; workers import it from its module."""
     arguments: tuple[Any, ...] = ()
     """What it is called with; they are pickled."""

@@ -1,44 +1,69 @@
 """Trials: ground to cross, planners that plan over it, and a robot that drives what they planned.
 
-Reads grounds, planners by name and a zoo; gives one `Trial` a planner, ground and seed. Every
-experiment's tasks call `drive`.
+Reads grounds, planners by name and a zoo; gives a `Trial` per planner, ground and seed, and counts
+of their rows. Every experiment that plans calls `drive`, or its two halves.
 Source: paper, Sec. IV-B: a trial fails if no route is found or the goal is not reached in time.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any, TypedDict, TypeVar
 
 from fgtutor.baselines import AssessedMap, Planner, find_route
 from fgtutor.elevation import ElevationMap
-from fgtutor.execution import FollowConfig, execute_batch
+from fgtutor.errors import ConfigError
+from fgtutor.evaluation.shards import RunConfig, digest
+from fgtutor.execution import Episode, FollowConfig, execute_batch
+from fgtutor.io.validation import Seed
 from fgtutor.routes import Refusal, Route
-from fgtutor.settings import PlanSettings
-from fgtutor.specialist import Specialist
+from fgtutor.settings import PlanOptions, PlanSettings
+from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo
 from fgtutor.world.terrain import Terrain
+
+R = TypeVar("R", bound=Mapping[str, Any])
 
 EPISODES = 50
 """Episodes simulated side by side."""
+FAILURES = ("no_route", "fell", "timeout")
+"""How a trial fails."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
-    """The outcome of one trial."""
+class ZooConfig(RunConfig):
+    """Whose specialists are evaluated."""
 
-    terrain: str
-    policy: str
-    """The policy or planner."""
-    ground: int
-    """Seed of the terrain."""
-    seed: int
-    """Seed of the episode: start pose and localisation noise."""
-    outcome: str
-    """reached | no_route | fell | timeout"""
-    length: float = 0.0
-    """Distance driven, m."""
-    seconds: float = 0.0
-    """Simulated time, s."""
-    switches: int = 0
-    """Policy changes on the way."""
+    robot: str = "toy"
+    """Which robot."""
+    seed: Seed = 0
+    """What grounds and starts are drawn from."""
+    zoo: Path | None = None
+    """Folder of specialist folders; default: the shipped zoo."""
+
+    @property
+    def home(self) -> Path:
+        """Where the specialists' folders lie."""
+        return self.zoo or ZOO / self.robot
+
+    @property
+    def folders(self) -> list[Path]:
+        """The specialists' folders."""
+        return sorted(path.parent for path in self.home.glob(f"[!._]*/{DESCRIPTION}"))
+
+    def load_zoo(self) -> dict[str, Specialist]:
+        """Return the specialists and the generalist, if there is one."""
+        return load_zoo(self.robot, self.home, include_general=True)
+
+    def zoo_digests(self) -> dict[str, str]:
+        """Return a digest of each of them, which changes with any of its weights."""
+        return {folder.name: digest((folder / DESCRIPTION).read_bytes()) for folder in self.folders}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedConfig(PlanOptions, ZooConfig):
+    """Which specialists plan, and by what settings."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,63 +73,183 @@ class Ground:
     terrain: Terrain
     """What the robot drives on."""
     seeds: tuple[int, ...]
-    """One episode each."""
+    """One episode each: its start pose and localisation noise."""
     seen: ElevationMap | None = None
     """The map that planning sees; default: the truth."""
+
+    def assess(self, zoo: Mapping[str, Specialist], settings: PlanSettings) -> AssessedMap:
+        """Return what a zoo says of the map that planning sees."""
+        return AssessedMap(self.seen or self.terrain.elevation, zoo, settings.taus)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Planned:
+    """What a planner answered for one ground."""
+
+    ground: Ground
+    """Where the plan leads."""
+    known: AssessedMap
+    """What it was planned on."""
+    answer: Route | Refusal
+    """The plan."""
+
+
+class Outcome(TypedDict):
+    """What every row of a report says of its trial."""
+
+    policy: str
+    """The policy or planner."""
+    ground: int
+    """Seed of the terrain."""
+    seed: int
+    """Seed of the episode."""
+    outcome: str
+    """reached, or one of `FAILURES`."""
+
+
+class TrialRow(Outcome):
+    """A trial, as a report keeps it."""
+
+    terrain: str
+    length: float
+    """Distance driven, m."""
+    seconds: float
+    """Simulated time, s."""
+    switches: int
+    """Policy changes on the way."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trial:
+    """One plan, driven once."""
+
+    policy: str
+    """The policy or planner."""
+    planned: Planned
+    """Its plan."""
+    seed: int
+    """Seed of the episode."""
+    episode: Episode | None = None
+    """The drive; None without a route."""
+
+    @property
+    def terrain(self) -> str:
+        """Name of the terrain."""
+        return self.planned.ground.terrain.name
+
+    @property
+    def outcome(self) -> str:
+        """How it ended: reached, or one of `FAILURES`."""
+        return self.episode.reason if self.episode else "no_route"
+
+    @property
+    def route(self) -> Route | None:
+        """The route that was driven."""
+        return self.planned.answer if isinstance(self.planned.answer, Route) else None
+
+    @property
+    def length(self) -> float:
+        """Distance driven, m."""
+        return round(self.episode.length, 3) if self.episode else 0.0
+
+    @property
+    def row(self) -> TrialRow:
+        """What a report keeps of it."""
+        return {
+            "terrain": self.terrain,
+            "policy": self.policy,
+            "ground": self.planned.ground.terrain.seed,
+            "seed": self.seed,
+            "outcome": self.outcome,
+            "length": self.length,
+            "seconds": round(self.episode.seconds, 3) if self.episode else 0.0,
+            "switches": self.episode.switches if self.episode else 0,
+        }
 
 
 def drive(
     grounds: Sequence[Ground],
-    planned: Mapping[str, Planner],
+    planners: Mapping[str, Planner],
     zoo: Mapping[str, Specialist],
     *,
     settings: PlanSettings,
-) -> list[Trial]:
+) -> Iterator[Trial]:
     """Plan over every ground with every planner, and drive the routes; planner by planner.
 
     Each (ground, specialist) is assessed once, each (ground, planner) planned once.
     """
-    maps = [
-        AssessedMap(ground.seen or ground.terrain.elevation, zoo, settings.taus)
-        for ground in grounds
-    ]
+    maps = [ground.assess(zoo, settings) for ground in grounds]
     follow = FollowConfig(hold_steps=settings.hold_steps)
-    trials: list[Trial] = []
-    for name, planner in planned.items():
-        jobs: dict[tuple[str, ...], list[tuple[Route, Terrain, int]]] = {}
-        for ground, known in zip(grounds, maps, strict=True):
-            terrain = ground.terrain
-            route = find_route(planner, known, terrain.start, terrain.goal, settings)
-            if isinstance(route, Refusal):
-                trials += (_trial(terrain, name, seed, "no_route") for seed in ground.seeds)
-                continue
-            work = jobs.setdefault(route.names, [])
-            work += ((route, terrain, seed) for seed in ground.seeds)
-        for work in jobs.values():
-            trials += _episodes(name, work, zoo, follow)
-    return trials
+    for name, planner in planners.items():
+        yield from drive_plans(name, plan_all(planner, grounds, maps, settings), zoo, follow)
 
 
-def _episodes(
-    name: str,
-    work: Sequence[tuple[Route, Terrain, int]],
-    zoo: Mapping[str, Specialist],
-    follow: FollowConfig,
+def plan_all(
+    planner: Planner,
+    grounds: Iterable[Ground],
+    maps: Iterable[AssessedMap],
+    settings: PlanSettings,
+) -> list[Planned]:
+    """Plan over every ground with one planner."""
+    return [
+        Planned(
+            ground=ground,
+            known=known,
+            answer=find_route(planner, known, ground.terrain.start, ground.terrain.goal, settings),
+        )
+        for ground, known in zip(grounds, maps, strict=True)
+    ]
+
+
+def drive_plans(
+    policy: str, plans: Iterable[Planned], zoo: Mapping[str, Specialist], follow: FollowConfig
 ) -> Iterator[Trial]:
-    """Drive routes, `EPISODES` at a time."""
-    for first in range(0, len(work), EPISODES):
-        routes, terrains, seeds = zip(*work[first : first + EPISODES], strict=True)
-        episodes = execute_batch(routes, terrains, zoo, seeds=seeds, config=follow)
-        for terrain, seed, episode in zip(terrains, seeds, episodes, strict=True):
-            yield replace(
-                _trial(terrain, name, seed, episode.reason),
-                length=round(episode.length, 3),
-                seconds=round(episode.seconds, 3),
-                switches=episode.switches,
-            )
+    """Drive what was planned, `EPISODES` at a time; what was refused comes first."""
+    jobs: dict[tuple[str, ...], list[tuple[Planned, Route, int]]] = {}
+    for planned in plans:
+        if isinstance(planned.answer, Refusal):
+            for seed in planned.ground.seeds:
+                yield Trial(policy=policy, planned=planned, seed=seed)
+        else:
+            job = jobs.setdefault(planned.answer.names, [])
+            job += ((planned, planned.answer, seed) for seed in planned.ground.seeds)
+    for job in jobs.values():
+        for first in range(0, len(job), EPISODES):
+            batch, routes, seeds = zip(*job[first : first + EPISODES], strict=True)
+            terrains = [planned.ground.terrain for planned in batch]
+            episodes = execute_batch(routes, terrains, zoo, seeds=seeds, config=follow)
+            for planned, seed, episode in zip(batch, seeds, episodes, strict=True):
+                yield Trial(policy=policy, planned=planned, seed=seed, episode=episode)
 
 
-def _trial(terrain: Terrain, policy: str, seed: int, outcome: str) -> Trial:
-    return Trial(
-        terrain=terrain.name, policy=policy, ground=terrain.seed, seed=seed, outcome=outcome
-    )
+def by_cell(
+    rows: Iterable[R], keys: Sequence[str] = ("terrain", "policy")
+) -> dict[tuple[Any, ...], list[R]]:
+    """Sort rows by the values of `keys`, in the order in which these first appear."""
+    cells: dict[tuple[Any, ...], list[R]] = {}
+    for row in rows:
+        cells.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return cells
+
+
+def failures(rows: Iterable[Mapping[str, Any]]) -> list[int]:
+    """Count the rows that failed, in the order of `FAILURES`."""
+    count = Counter(row["outcome"] for row in rows)
+    return [count[reason] for reason in FAILURES]
+
+
+def mean_if_reached(rows: Iterable[Mapping[str, Any]], key: str) -> str:
+    """Write the mean of a value over the trials that reached their goal; a dash if none did."""
+    values = [row[key] for row in rows if row["outcome"] == "reached"]
+    return f"{fmean(values):.1f}" if values else "-"
+
+
+def choose(what: str, names: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
+    """Return the known names that are asked for, in their order: all, if none is.
+
+    Raises `ConfigError` for a name that is not known.
+    """
+    known = tuple(known)
+    if unknown := [name for name in names if name not in known]:
+        raise ConfigError(f"no {what} named {', '.join(unknown)}; choose of {', '.join(known)}")
+    return tuple(name for name in known if not names or name in names)
