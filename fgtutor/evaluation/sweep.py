@@ -231,7 +231,7 @@ def estimate(config: SweepConfig) -> Cost:
     """
     works = trainings(config).values()
     samples, seconds = 0, 0.0
-    for value in dict(works):
+    for value in dict.fromkeys(value for value, _ in works):
         same = [train for own, train in works if own == value]
         trainer = Trainer(replace(same[0], device="cpu"))
         first, second = (trainer.iterate()["seconds"] for _ in range(2))
