@@ -148,14 +148,8 @@ class Crossings:
     ) -> None:
         """Tabulate the lanes of `world` and put all robots on its first row.
 
-        Args:
-            world: The tiles.
-            num_envs: Number of robots.
-            config: How episodes are drawn.
-            grid: Where patches are sampled.
-            look: Returns the patches at poses (x, y, yaw).
-            uniform: Draws numbers in [0, 1), of the shape given.
-            device: Where the tensors lie.
+        `look` returns the patches at poses (x, y, yaw), sampled at `grid`; `uniform` draws numbers
+        in [0, 1) of a given shape.
         """
         self.config, self.grid, self._look, self._uniform = config, grid, look, uniform
         tiles, size = world.tiles, world.tiles[0][0].elevation.size
@@ -165,30 +159,21 @@ class Crossings:
         near = np.array([[tile.span for tile in row] for row in tiles])
         near = near + config.run_up * np.array([-1.0, 1.0])
         near = np.clip(near, ends.min(-1, keepdims=True), ends.max(-1, keepdims=True))
-        tables = (
-            world.offset,
-            [[np.interp(x, *np.array(sorted(tile.lane)).T) for tile in row] for row in tiles],
-            [[tile.spread for tile in row] for row in tiles],
-            [[tile.limits or (0.0, size[0]) for tile in row] for row in tiles],
-            ends,
-            near,
-        )
+        lanes = [[np.interp(x, *np.array(sorted(tile.lane)).T) for tile in row] for row in tiles]
+        spreads = [[tile.spread for tile in row] for row in tiles]
+        limits = [[tile.limits or (0.0, size[0]) for tile in row] for row in tiles]
         self.offsets, self.lanes, self.spreads, self.limits, self.ends, self.near = (
-            torch.as_tensor(np.array(table), dtype=torch.float32, device=device) for table in tables
+            torch.as_tensor(np.array(table), dtype=torch.float32, device=device)
+            for table in (world.offset, lanes, spreads, limits, ends, near)
         )
         self.num_rows, self.num_columns = self.offsets.shape[:2]
         self.tile_size = torch.tensor(size, dtype=torch.float32, device=device)
         self.everyone = torch.arange(num_envs, device=device)
         self.row = torch.zeros(num_envs, dtype=torch.long)
         self.column = torch.arange(num_envs) % self.num_columns
-        self.target_yaw = torch.zeros(num_envs, device=device)
-        self.told_yaw = torch.zeros(num_envs, device=device)
-        self.anchor = torch.zeros(num_envs, 2, device=device)
-        self.begin = torch.zeros(num_envs, 2, device=device)
-        self.turning = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self.crossing = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self.aside = torch.zeros(num_envs, device=device)
-        self.stuck_from = torch.zeros(num_envs, 2, device=device)
+        self.target_yaw, self.told_yaw, self.aside = torch.zeros(3, num_envs, device=device)
+        self.anchor, self.begin, self.stuck_from = torch.zeros(3, num_envs, 2, device=device)
+        self.turning, self.crossing = torch.zeros(2, num_envs, dtype=torch.bool, device=device)
         self.stuck_steps = torch.zeros(num_envs, dtype=torch.long, device=device)
 
     def corner(self, ids: Int[Tensor, "n"]) -> Float[Tensor, "n 2"]:
@@ -272,9 +257,8 @@ class Crossings:
         turn = self.turning & (self._uniform(len(pose)) < dt / 2.0)
         if turn.any():
             eighths = torch.floor(self._uniform(len(pose)) * 5) - 2
-            self.target_yaw = torch.where(
-                turn, self.target_yaw + eighths * (math.pi / 4), self.target_yaw
-            )
+            turned = self.target_yaw + eighths * (math.pi / 4)
+            self.target_yaw = torch.where(turn, turned, self.target_yaw)
             self.anchor = torch.where(turn[:, None], pose[:, :2], self.anchor)
             self.crossing &= ~turn
         wanted = self.target_yaw - bearing(self._beside_line(pose))
@@ -369,11 +353,9 @@ class Crossings:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take over stored tiles; raises `ValueError` if there is no such row or column here."""
-        for name, own, number in (
-            ("row", self.row, self.num_rows),
-            ("column", self.column, self.num_columns),
-        ):
-            fits = (state[name].shape, state[name].dtype) == (own.shape, own.dtype)
-            if not (fits and ((state[name] >= 0) & (state[name] < number)).all()):
+        for name, number in (("row", self.num_rows), ("column", self.num_columns)):
+            value, own = state[name], getattr(self, name)
+            fits = (value.shape, value.dtype) == (own.shape, own.dtype)
+            if not (fits and ((value >= 0) & (value < number)).all()):
                 raise ValueError(f"the {name} of each robot should be one of {number}")
         self.row, self.column = state["row"].clone(), state["column"].clone()

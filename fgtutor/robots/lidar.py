@@ -21,13 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from fgtutor.errors import CloudError, ConfigError
 from fgtutor.io.cloud import Points
-from fgtutor.io.validation import (
-    Ascending,
-    NonNegative,
-    Positive,
-    check_arguments,
-    check_fields,
-)
+from fgtutor.io.validation import Ascending, NonNegative, Positive, check_arguments, check_fields
 from fgtutor.robots.a1.ground import add_box
 from fgtutor.robots.a1.looks import dress
 from fgtutor.robots.a1.model import STANCE, STANCE_HEIGHT, build_spec
@@ -122,11 +116,8 @@ def survey(
     # Every other line is shifted by half a step.
     x = x0 + (step + 0.25 + 0.5 * (line % 2)) * (x1 - x0) / along
     y = y0 + (line + 0.5) * (y1 - y0) / across
-    same = np.ones(len(x))
-    return np.stack(
-        (x, y, (top + height) * same, np.pi * same, np.radians(40) * same, np.pi * (step % 2)),
-        axis=-1,
-    )
+    z, roll, pitch = (np.full(len(x), value) for value in (top + height, np.pi, np.radians(40)))
+    return np.column_stack((x, y, z, roll, pitch, np.pi * (step % 2)))
 
 
 def carried(terrain: Terrain, spots: Float[np.ndarray, "poses 3"]) -> Poses:
@@ -134,9 +125,8 @@ def carried(terrain: Terrain, spots: Float[np.ndarray, "poses 3"]) -> Poses:
     x, y, yaw = np.asarray(spots, dtype=float).T
     z = terrain.elevation.filled().height_at(x, y) + STANCE_HEIGHT
     mount = Rotation.from_euler("z", yaw[:, None]).apply(MOUNT)
-    return np.column_stack(
-        (x + mount[:, 0], y + mount[:, 1], z + mount[:, 2], np.full(len(x), MOUNT_ROLL), 0 * x, yaw)
-    )
+    place = np.column_stack((x, y, z)) + mount
+    return np.column_stack((place, np.full(len(x), MOUNT_ROLL), np.zeros(len(x)), yaw))
 
 
 def scan_terrain(

@@ -58,9 +58,6 @@ class Physics:
         self.qpos: Float64[Tensor, "sims nq"] = torch.from_numpy(self._batch.bind("qpos"))
         self.qvel: Float64[Tensor, "sims nv"] = torch.from_numpy(self._batch.bind("qvel"))
         self.ctrl: Float64[Tensor, "sims nu"] = torch.from_numpy(self._batch.bind("ctrl"))
-        self.applied: Float64[Tensor, "sims bodies 6"] = torch.from_numpy(
-            self._batch.bind("xfrc_applied")
-        )
         self.sensors: Float64[Tensor, "sims nsensordata"] = self.derived("sensordata")
         self.reset()
         self.forward()
