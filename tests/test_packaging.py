@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 import tomllib
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -37,6 +38,7 @@ def declared(extra: str | None = None) -> set[str]:
     return {canonicalize_name(Requirement(line).name) for line in lines}
 
 
+@cache
 def imported(path: Path) -> set[str]:
     """Return the packages of others that a file imports, wherever in it."""
     names: set[str] = set()
