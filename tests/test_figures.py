@@ -19,7 +19,7 @@ from PIL import Image
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, StorageError
 from fgtutor.execution import Episode
-from fgtutor.figures import charts, maps, videos
+from fgtutor.figures import charts, maps, toy_film, videos
 from fgtutor.fusion import fuse
 from fgtutor.planning import Plan, plan
 from fgtutor.statistics import Share, calibration
@@ -52,8 +52,9 @@ def planned(ground) -> Plan:
     tensors = [torch.tensor(left), torch.tensor(left[::-1].copy())]
     fused, policy_map = fuse(tensors)
     route = plan(
-        fused, policy_map, grid=ground, start=START, goal=GOAL, tensors=tensors, names=NAMES
-    )
+        fused, policy_map, grid=ground, start=START, goal=GOAL, tensors=tensors, names=NAMES,
+        switch_cost=0.0,
+    )  # fmt: skip
     return Plan(NAMES, tensors, {}, fused, policy_map, route)
 
 
@@ -206,15 +207,15 @@ def test_the_policy_map_shows_who_is_best_and_what_is_closed(ground, planned):
 
 
 def test_the_plan_figure_has_every_panel(ground, planned, tmp_path):
-    weights = {name: np.ones((40, 10, 8)) for name in NAMES}
-    figure = maps.plan_figure(ground, planned, weights)
+    weights = {name: torch.ones(40, 10, 8) for name in NAMES}
+    figure = maps.plan_figure(ground, replace(planned, weights=weights))
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert [t for t in titles if t and t[0] in "134"] and {"steps", "gaps"} <= set(titles)
     path = maps.save_figure(figure, tmp_path / "plan.png", dpi=50)
     with Image.open(path) as image:
         assert image.width > 500
     with pytest.raises(ConfigError, match="gaps"):
-        maps.plan_figure(ground, planned, {"steps": weights["steps"]})
+        maps.plan_figure(ground, replace(planned, weights={"steps": weights["steps"]}))
 
 
 def test_figures_draw_in_threads(ground, planned):
@@ -331,28 +332,28 @@ def test_a_video_lasts_as_long_as_the_drive(tmp_path, episode, terrain, planned,
 
 
 def test_the_side_view_shows_the_robot_in_its_policys_colour(episode, terrain, planned):
-    film = videos.Film(episode, terrain, planned.route)
+    film = toy_film.ToyFilm(episode, terrain, planned.route)
     for t, name in ((10, "steps"), (40, "gaps")):
         image = np.asarray(film.side(t)).astype(float)
         # The chassis' centre lies above s = 0, at the camera's height: z = 0.3 everywhere.
-        u, v = round(videos.BEHIND * videos.SCALE), round(0.5 * videos.SIDE[1])
+        u, v = round(toy_film.BEHIND * toy_film.SCALE), round(0.5 * toy_film.SIDE[1])
         colour = 255 * np.array(to_rgb(maps.POLICY_COLOURS[name]))
         assert np.abs(image[v, u] - colour).max() < 2
 
 
 def test_ground_along_keeps_cliffs_and_mirrors(ground):
-    s, h = videos.ground_along(ground.filled(), 1.5, 0.5, 0.0, -0.5, 1.2)
+    s, h = toy_film.ground_along(ground.filled(), 1.5, 0.5, 0.0, -0.5, 1.2)
     assert set(h[(s > 0.52) & (s < 0.68)]) == {-1.0}
     assert set(h[(s < 0.48) | (s > 0.72)]) == {0.0}
-    back, mirrored = videos.ground_along(ground.filled(), 2.0, 0.5, np.pi, -0.55, 0.55)
-    s, h = videos.ground_along(ground.filled(), 2.0, 0.5, 0.0, -0.55, 0.55)
+    back, mirrored = toy_film.ground_along(ground.filled(), 2.0, 0.5, np.pi, -0.55, 0.55)
+    s, h = toy_film.ground_along(ground.filled(), 2.0, 0.5, 0.0, -0.55, 0.55)
     inside = np.abs(np.abs(s) % 0.1 - 0.05) < 0.03  # away from the borders of cells
     np.testing.assert_allclose(np.interp(-s, back, mirrored)[inside], h[inside], atol=1e-6)
 
 
 def test_frames_are_the_same_each_time(episode, terrain, planned):
     first, second = (
-        videos.Film(episode, terrain, planned.route).frame(20).tobytes() for _ in range(2)
+        toy_film.ToyFilm(episode, terrain, planned.route).frame(20).tobytes() for _ in range(2)
     )
     assert first == second
 
@@ -374,7 +375,7 @@ def test_the_film_strip_holds_every_view(episode, terrain, planned, count):
 )
 def test_an_episode_without_a_toy_is_refused(episode, terrain, planned, change):
     with pytest.raises(ConfigError, match="record the episode"):
-        videos.Film(replace(episode, **change), terrain, planned.route)
+        toy_film.ToyFilm(replace(episode, **change), terrain, planned.route)
 
 
 def test_an_episode_of_one_step_is_a_film(episode, terrain, planned):
@@ -385,9 +386,9 @@ def test_an_episode_of_one_step_is_a_film(episode, terrain, planned):
         body=episode.body[:1],
         seconds=0.04,
     )
-    film = videos.Film(single, terrain, planned.route)
+    film = toy_film.ToyFilm(single, terrain, planned.route)
     assert film.times() == [0, 0]
-    assert film.frame(0).width == videos.WIDTH
+    assert film.frame(0).width == toy_film.WIDTH
 
 
 # Faults -------------------------------------------------------------------------------------------

@@ -73,7 +73,7 @@ def run(config: DemoConfig) -> int:
         )
     write_json(config.out / "route.json", plan.route.to_json())
     announce("route.json", str(plan.route))
-    save_figure(plan_figure(elevation, plan, plan.weights), config.out / "plan.png")
+    save_figure(plan_figure(elevation, plan), config.out / "plan.png")
     announce("plan.png", "the map and route, w_ood, F_max and the policy map")
 
     with waiting("driving the route"):

@@ -14,7 +14,7 @@ from PIL import Image, ImageOps
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.execution import Episode, FollowConfig
-from fgtutor.figures.films import BAR, SKY, EpisodeFilm, MapView
+from fgtutor.figures.episode_film import BAR, SKY, EpisodeFilm, MapView
 from fgtutor.robots.a1.looks import a1_scene
 from fgtutor.robots.offscreen import Renderer, Shot
 from fgtutor.routes import Route

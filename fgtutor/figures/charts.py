@@ -5,7 +5,7 @@ Reads numbers by name; gives pictures. A policy has its own colour here as every
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -18,22 +18,13 @@ from torch import Tensor
 
 from fgtutor.errors import ConfigError
 from fgtutor.feasibility import ood_weight
-from fgtutor.figures.canvas import POLICY_COLOURS, TITLE, Picture
+from fgtutor.figures.style import INK, LINES, TITLE, Picture, colours_of
 from fgtutor.io.validation import Positive, check_arguments
 from fgtutor.statistics import Share
 from fgtutor.world.terrain import Terrain
 
 if TYPE_CHECKING:
     from fgtutor.execution import Episode
-
-LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Colours of curves that belong to no policy, in turn."""
-INK = "#1E2328"
-
-
-def colours_of(names: Iterable[str]) -> list[str]:
-    """Return for each name the policy's own colour, or the next of the curves' colours."""
-    return [POLICY_COLOURS.get(n, LINES[i % len(LINES)]) for i, n in enumerate(names)]
 
 
 def draw_curves(

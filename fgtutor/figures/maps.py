@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from fgtutor import directions
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.figures.canvas import POLICY_COLOURS, TITLE, Picture, policy_colours, save_figure
+from fgtutor.figures.style import POLICY_COLOURS, TITLE, Picture, policy_colours, save_figure
 from fgtutor.io.validation import Count, check_arguments
 
 if TYPE_CHECKING:
@@ -241,13 +241,12 @@ def draw_policy_map(
     return _root(axes)
 
 
-def plan_figure(
-    elevation: ElevationMap, plan: Plan, weights: Mapping[str, ArrayLike], *, f_min: float = 0.1
-) -> Picture:
+def plan_figure(elevation: ElevationMap, plan: Plan, *, f_min: float = 0.1) -> Picture:
     """Draw a whole plan in four panels: M with the route, w_ood of every policy, F_max, P.
 
-    `weights` holds w_ood [nx, ny, 8] by policy name. Raises `ConfigError` if one is missing.
+    Raises `ConfigError` if the plan holds no w_ood of a policy.
     """
+    weights = plan.weights
     missing = [name for name in plan.names if name not in weights]
     if missing:
         raise ConfigError(f"plan_figure needs w_ood of every policy, got none of {missing}")

@@ -30,7 +30,7 @@ class Robot:
     order: tuple[str, ...] = ()
     """What follows what on the course of `evaluate switching`; default: as in `scale.mixed`."""
     film: str | None = None
-    """Module and class of its film (a subclass of `figures.films.EpisodeFilm`), if it has one."""
+    """Module and class of its film (a subclass of `figures.episode_film.EpisodeFilm`), if it has one."""
 
     @property
     def course(self) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ ROBOTS = {
             mixed=("steps", "gaps", "slopes", "rubble"),
         ),
         order=("steps", "slopes", "steps", "gaps", "rubble", "steps"),
-        film="fgtutor.figures.videos:Film",
+        film="fgtutor.figures.toy_film:ToyFilm",
     ),
     "a1": Robot(
         env="fgtutor.robots.a1.env:A1Env",

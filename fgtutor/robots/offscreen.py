@@ -1,23 +1,23 @@
 """Drawing a MuJoCo model without a window, by a process of its own.
 
-Reads a model, and one `Shot` a picture; gives the pictures. A graphics library that is missing or
+Reads a model, and one `Shot` per picture; gives the pictures. A graphics library that is missing or
 broken may abort the process that loads it, and MuJoCo chooses the library when it is imported: so a
-child process draws, and sends raw pixels.
+child process draws, and sends raw pixels. It is a plain `python -m`, because multiprocessing (and
+pebble on top of it) would run the caller's script a second time to start one.
 """
 
 # MuJoCo's compiled modules carry no type information that pyright could read.
 # pyright: reportAttributeAccessIssue=false
 
 import os
+import pickle
 import subprocess
 import sys
 import tempfile
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
-from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
@@ -55,11 +55,6 @@ class Shot:
     coat: tuple[float, float, float] = (0.5, 0.5, 0.5)
     """Red, green and blue of the material "coat", each in [0, 1]."""
 
-    def pack(self) -> bytes:
-        """Return the bytes that the drawing process reads."""
-        camera = (*self.target, self.distance, self.azimuth, self.elevation, *self.coat)
-        return np.concatenate((camera, self.qpos)).astype(np.float64).tobytes()
-
 
 class Renderer:
     """A process that draws one model, for a `with` block.
@@ -76,21 +71,17 @@ class Renderer:
         `patience` is how long the start, or one picture, may take at most, s. The model's
         off-screen buffer must be at least as large as the pictures.
         """
-        import mujoco  # here, because the drawing process must choose its library before
-
         self.shape, self.patience = (height, width, 3), patience
-        self._folder = tempfile.TemporaryDirectory(prefix="fgtutor-", ignore_cleanup_errors=True)
-        mujoco.mj_saveModel(model, str(self._path("model.mjb")))
         wanted = os.environ.get("MUJOCO_GL")
         refusals = []
         for self.backend in (wanted,) if wanted else GL_BACKENDS.get(sys.platform, ()):
-            self._process = self._start()
-            with self._deadline() as late:
-                answer = self._pipe("stdout").read(len(READY))
-            if answer == READY:
+            self._start()
+            try:
+                self._read(len(READY), question=model)
                 return
-            refusals.append(f"{self.backend}: {self._last_words(late)}")
-        self.close()
+            except EOFError as error:
+                refusals.append(f"{self.backend}: {error}")
+                self.close()
         reasons = "; ".join(refusals) or f"none is known for {sys.platform}"
         raise RenderingError(f"no graphics library draws MuJoCo's scenes ({reasons}): {CURE}")
 
@@ -102,11 +93,10 @@ class Renderer:
 
     def close(self) -> None:
         """End the process."""
-        if process := getattr(self, "_process", None):
-            process.kill()
-            with suppress(BrokenPipeError):
-                process.communicate()
-        self._folder.cleanup()
+        self._process.kill()
+        with suppress(BrokenPipeError):
+            self._process.communicate()
+        self._log.close()
 
     def draw(self, shot: Shot) -> UInt8[np.ndarray, "height width 3"]:
         """Return one picture; raises `RenderingError` if the process ends or hangs."""
@@ -120,54 +110,56 @@ class Renderer:
         """
         waiting = 0
         try:
-            for shot in chain(shots, (None,)):
-                if shot:
-                    self._ask(shot)
-                    waiting += 1
-                if waiting == 2 or (waiting and not shot):
+            for shot in shots:
+                self._ask(shot)
+                waiting += 1
+                if waiting == 2:
                     waiting -= 1
-                    yield self._receive()
+                    yield self._picture()
+            if waiting:
+                waiting -= 1
+                yield self._picture()
         finally:
-            # Whoever stops half-way must not leave a picture in the pipe for the next film.
+            # A film that is left half-way must not leave a picture in the pipe for the next one.
             with suppress(RenderingError):
                 for _ in range(waiting):
-                    self._receive()
+                    self._picture()
 
-    def _ask(self, shot: Shot) -> None:
-        # A pipe that breaks means that the process has ended; reading its answer says why.
-        with suppress(BrokenPipeError):
-            self._pipe("stdin").write(shot.pack())
-            self._pipe("stdin").flush()
-
-    def _receive(self) -> UInt8[np.ndarray, "height width 3"]:
-        size = int(np.prod(self.shape))
-        with self._deadline() as late:
-            pixels = self._pipe("stdout").read(size)
-        if len(pixels) < size:
-            words = self._last_words(late)
-            raise RenderingError(f"drawing with {self.backend} stopped ({words}): {CURE}")
-        return np.frombuffer(pixels, dtype=np.uint8).reshape(self.shape)
-
-    def _start(self) -> subprocess.Popen[bytes]:
+    def _start(self) -> None:
         # What PyOpenGL was told in this process may contradict the library to try.
         environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
         height, width, _ = self.shape
-        with self._path("log.txt").open("wb") as log:
-            return subprocess.Popen(
-                [
-                    *(sys.executable, "-P", "-m", __name__),  # -P: no module of the current folder
-                    *(self._path("model.mjb"), str(width), str(height)),
-                ],
-                env={**environment, "MUJOCO_GL": self.backend},
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-            )
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115, `close` closes it
+        self._process = subprocess.Popen(
+            # -P: no module of the current folder
+            [sys.executable, "-P", "-m", __name__, str(width), str(height)],
+            env={**environment, "MUJOCO_GL": self.backend},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+        )
 
-    @contextmanager
-    def _deadline(self) -> Iterator[threading.Event]:
-        """End the process, and set the event, if the block takes longer than `patience`."""
-        late, process = threading.Event(), self._process
+    def _ask(self, question: object) -> None:
+        # A pipe that breaks means that the process has ended; reading its answer says why.
+        pipe = cast(IO[bytes], self._process.stdin)
+        with suppress(BrokenPipeError):
+            pickle.dump(question, pipe)
+            pipe.flush()
+
+    def _picture(self) -> UInt8[np.ndarray, "height width 3"]:
+        try:
+            pixels = self._read(int(np.prod(self.shape)))
+        except EOFError as error:
+            stopped = f"drawing with {self.backend} stopped ({error}): {CURE}"
+            raise RenderingError(stopped) from error
+        return np.frombuffer(pixels, dtype=np.uint8).reshape(self.shape)
+
+    def _read(self, size: int, question: object = None) -> bytes:
+        """Return `size` bytes of the process's answer, asking the question before if there is one.
+
+        Raises `EOFError`, which says why, if the process ends or takes longer than `patience`.
+        """
+        process, late = self._process, threading.Event()
 
         def stop() -> None:
             late.set()
@@ -176,35 +168,30 @@ class Renderer:
         timer = threading.Timer(self.patience, stop)
         timer.start()
         try:
-            yield late
+            if question is not None:
+                self._ask(question)
+            answer = cast(IO[bytes], process.stdout).read(size)
         finally:
             timer.cancel()
-
-    def _last_words(self, late: threading.Event) -> str:
-        """Return why the process ended: its last line, or its exit code."""
-        with suppress(BrokenPipeError):
-            self._process.communicate()
-        if late.is_set():
-            return f"no picture within {self.patience:g} s"
-        lines = self._path("log.txt").read_text(errors="replace").split("\n")
+        if len(answer) == size:
+            return answer
+        process.wait()
+        self._log.seek(0)
+        lines = self._log.read().decode(errors="replace").split("\n")
         said = [line.strip() for line in lines if line.strip()]
-        return said[-1] if said else f"it ended with code {self._process.returncode}"
-
-    def _pipe(self, name: str) -> IO[bytes]:
-        return cast(IO[bytes], getattr(self._process, name))
-
-    def _path(self, name: str) -> Path:
-        return Path(self._folder.name) / name
+        if late.is_set():
+            raise EOFError(f"no picture within {self.patience:g} s")
+        raise EOFError(said[-1] if said else f"it ended with code {process.returncode}")
 
 
-def serve(path: str, width: int, height: int) -> None:
-    """Draw what standard input asks for, until it ends; the work of the child process."""
+def serve(width: int, height: int) -> None:
+    """Draw the shots of a model, both read from standard input; the work of the child process."""
     import mujoco
 
     # Whatever a graphics library prints must not end up between the pixels.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    model = mujoco.MjModel.from_binary_path(path)
+    model = pickle.load(sys.stdin.buffer)
     data = mujoco.MjData(model)
     coats = [i for i in range(model.nmat) if model.material(i).name == COAT]
     camera = mujoco.MjvCamera()
@@ -223,15 +210,18 @@ def serve(path: str, width: int, height: int) -> None:
             raise SystemExit("the picture came out black")
         answers.write(READY)
         answers.flush()
-        size = 8 * (9 + model.nq)
-        while len(row := sys.stdin.buffer.read(size)) == size:
-            numbers = np.frombuffer(row)
-            camera.lookat[:] = numbers[:3]
-            camera.distance, camera.azimuth, camera.elevation = numbers[3:6]
-            model.mat_rgba[coats, :3] = numbers[6:9]
-            answers.write(draw(numbers[9:]).tobytes())
+        while True:
+            try:
+                shot = pickle.load(sys.stdin.buffer)
+            except EOFError:
+                return
+            camera.lookat[:] = shot.target
+            camera.distance, camera.azimuth = shot.distance, shot.azimuth
+            camera.elevation = shot.elevation
+            model.mat_rgba[coats, :3] = shot.coat
+            answers.write(draw(shot.qpos).tobytes())
             answers.flush()
 
 
 if __name__ == "__main__":
-    serve(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+    serve(int(sys.argv[1]), int(sys.argv[2]))

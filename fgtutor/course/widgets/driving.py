@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 
 from fgtutor.errors import ConfigError
 from fgtutor.execution import Episode
-from fgtutor.figures.videos import Film
+from fgtutor.figures.toy_film import ToyFilm
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.routes import Route
@@ -146,7 +146,7 @@ class Drive:
             length=0.0,
             names=tuple(self.zoo),
         )
-        return np.asarray(Film(episode, self.terrain, nowhere).side(len(episode.poses) - 1))
+        return np.asarray(ToyFilm(episode, self.terrain, nowhere).side(len(episode.poses) - 1))
 
     @property
     def status(self) -> str:

@@ -20,8 +20,8 @@ from PIL import Image, ImageDraw, ImageFont
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.execution import Episode
-from fgtutor.figures.canvas import Picture, policy_colours
 from fgtutor.figures.maps import draw_elevation, draw_route
+from fgtutor.figures.style import INK, Picture, policy_colours
 from fgtutor.routes import Route
 from fgtutor.world.terrain import Terrain
 
@@ -29,7 +29,7 @@ WIDTH = 720
 """Width of a frame, pixels; like every size of a frame a multiple of 16, as video codecs want."""
 FPS = 12.5
 """Frames per second: a whole number of the robots' control steps and of GIF's 1/100 s."""
-SKY, INK = "#F3F7FA", "#1E2328"
+SKY = "#F3F7FA"
 BAR = 12
 """Height of the bar of policies, pixels."""
 
@@ -124,12 +124,8 @@ class MapView:
         height = height if bare else round(np.clip(0.9 * height + 40, 160, 640) / 16) * 16
         figure = Picture(width / 100, height / 100)
         axes = figure.subplots()
-        draw_elevation(ground, axes=axes)
-        figure.axes[1].remove()  # the colour bar: a film is no place to read numbers
-        draw_route(route, ground, axes=axes)
-        figure.legends.clear()
-        axes.set_title("", loc="left")
-        axes.set(xlabel="", ylabel="")
+        draw_elevation(ground, axes=axes, bare=True)
+        draw_route(route, ground, axes=axes, bare=True)
         if bare:
             figure.set_layout_engine("none")
             axes.set_axis_off()

@@ -1,11 +1,11 @@
-"""What every picture of the course shares: the canvas, the colours, the way to a file.
+"""The style that all pictures share: colours, titles, the kind of figure, and how one is saved.
 
 Gives `Picture`, a matplotlib figure that a notebook shows by itself and that any thread may draw.
 Nothing here touches pyplot, whose figures are global state.
 """
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -29,6 +29,10 @@ POLICY_COLOURS = {
 """A policy has one colour in the whole course: Okabe and Ito's, safe for the colour-blind."""
 OTHER_COLOURS = ("#882255", "#999933", "#332288", "#F0E442")
 """Policies that the course does not know take these in turn: Paul Tol's muted ones and a yellow."""
+LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+"""Colours of curves that belong to no policy, in turn."""
+INK = "#1E2328"
+"""The colour of words and outlines."""
 TITLE = {"fontsize": 10.5, "weight": "bold", "ha": "left"}
 """How titles look."""
 Panels = Annotated[int, Interval(ge=1, le=1000)]
@@ -72,3 +76,8 @@ def policy_colours(names: Sequence[str]) -> dict[str, str]:
     strangers = [name for name in names if name not in POLICY_COLOURS]
     others = {name: OTHER_COLOURS[i % len(OTHER_COLOURS)] for i, name in enumerate(strangers)}
     return {name: POLICY_COLOURS.get(name) or others[name] for name in names}
+
+
+def colours_of(names: Iterable[str]) -> list[str]:
+    """Return for each name the policy's own colour, or the next of the curves' colours."""
+    return [POLICY_COLOURS.get(name, LINES[i % len(LINES)]) for i, name in enumerate(names)]
