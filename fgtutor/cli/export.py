@@ -194,8 +194,7 @@ def _answer(policy: MLPModel, observations: Tensor) -> Tensor:
     """Return the deterministic actions for observations [n, obs_dim], its groups joined."""
     # The policy joins its groups anyway, so the first may stand for all.
     first, *others = policy.obs_groups
-    groups = {name: observations[:, :0] for name in others} | {first: observations}
-    groups = {name: groups[name] for name in policy.obs_groups}
+    groups = {first: observations} | {name: observations[:, :0] for name in others}
     with torch.no_grad():
         return policy(TensorDict(groups, batch_size=[len(observations)]))
 
