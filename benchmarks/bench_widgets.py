@@ -53,9 +53,9 @@ def noisy_world() -> Explorer:
     return Explorer(grid, said, grid.centre_of(5, 5), grid.centre_of(122, 122))
 
 
-def drag(explorer: Explorer, count: int, **settings: float) -> str:
+def drag(explorer: Explorer, count: int, switch_cost: float) -> str:
     """Move tau_high through its range and say what that took."""
-    explorer.update(**settings)
+    explorer.update(switch_cost=switch_cost)
     view = TauPictures(explorer)
     cpu, wall = [], []
 
@@ -84,7 +84,7 @@ def main() -> None:
     for name, make in (("demo", real_world), ("noise", noisy_world)):
         explorer = make()
         for switch_cost in (0.0, 1.0, 3.0):
-            row = drag(explorer, count, switch_cost=switch_cost)
+            row = drag(explorer, count, switch_cost)
             print(f"{name:6}{switch_cost:13.1f} {row}", flush=True)
 
 

@@ -12,6 +12,23 @@
 
 Every stage is a function over plain values, so that you can stop anywhere and look. The names below
 are imported when first used: `import fgtutor` itself loads neither torch nor a simulator.
+
+Imports point one way, from a layer to those below it:
+
+    course                                   notebooks, exercises and their marks, widgets
+    cli                                      the commands demo, plan, map, doctor, export
+    evaluation                               the tables: trials, matrix, adaptation, switching
+    figures                                  every picture and film
+    execution | baselines                    driving a route; planners to compare with
+    planning | paper | learning              the route; the paper in one file; training
+    fusion | tensorization | graphs | routes
+    specialist
+    policies | robots | feasibility          what a specialist is made of and trained on
+    patches | world                          what a policy sees; terrains
+    elevation | settings
+    io                                       files, progress, checks of values from outside
+    directions | statistics | grid
+    errors
 """
 
 import importlib
