@@ -8,7 +8,9 @@ import test_robots
 
 from fgtutor import execute, fuse, make_terrain, plan, tensorize, train
 from fgtutor.cli.export import describe
+from fgtutor.errors import ConfigError
 from fgtutor.evaluation.switching import SwitchingConfig, courses
+from fgtutor.figures.videos import film_of
 from fgtutor.learning.config import TrainConfig, config_of
 from fgtutor.robots import ROBOTS, Robot
 from fgtutor.world.obstacles import TerrainScale
@@ -56,6 +58,8 @@ def test_it_is_trained_assessed_planned_for_and_driven(tmp_path):
     episode = execute(route, terrain, {"steps": steps})
     assert (episode.reason, episode.robot) == ("reached", "puck")
     assert episode.body is not None and episode.body.shape == (len(episode.poses), 4)
+    with pytest.raises(ConfigError, match="puck has no film: name one in its entry"):
+        film_of(episode, terrain, route)
 
 
 def test_its_obstacles_can_be_laid_and_evaluated():

@@ -30,7 +30,7 @@ class Robot:
     order: tuple[str, ...] = ()
     """What follows what on the course of `evaluate switching`; default: as in `scale.mixed`."""
     film: str | None = None
-    """Module and class of its film (a subclass of `figures.episode_film.EpisodeFilm`), if it has one."""
+    """Module and class of its film, a `figures.episode_film.EpisodeFilm`, if it has one."""
 
     @property
     def course(self) -> tuple[str, ...]:
