@@ -64,7 +64,7 @@ QUESTIONS = (
                 lambda xy, o, r: ((xy - o) / r).astype(int),
             ),
             Mistake(
-                "a product for a quotient: metres divided by metres a cell gives cells.",
+                "a product for a quotient: metres divided by metres per cell gives cells.",
                 lambda xy, o, r: np.floor((xy - o) * r).astype(int),
             ),
         ),

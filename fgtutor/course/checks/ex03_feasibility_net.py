@@ -97,7 +97,7 @@ QUESTIONS = (
         points=2,
         title="the KL term",
         expects="KL(N(mean, variance) || N(0, 1)) = 1/2 sum over the latent of mean^2 + variance - "
-        "1 - log variance: one number a patch, 0 only for mean 0 and variance 1.",
+        "1 - log variance: one number per patch, 0 only for mean 0 and variance 1.",
         draw=_latent,
         examples=((np.zeros((1, 2)), np.zeros((1, 2))),),
         truth=lambda mean, log_variance: (
@@ -128,7 +128,7 @@ QUESTIONS = (
         ),
         hints=(
             "The variance is np.exp(log_variance).",
-            "Sum over the last axis: one divergence a patch.",
+            "Sum over the last axis: one divergence per patch.",
         ),
     ),
     Question(

@@ -31,7 +31,7 @@ QUESTIONS = (
         name="reconstruction_loss",
         points=2,
         title="L_recon of a patch",
-        expects="L_recon is one number a patch: the SUM over its points of the squared error, in "
+        expects="L_recon is one number per patch: the SUM over its points of the squared error, in "
         "the scaled units that the VAE sees (height_scale * metres).",
         draw=_patches,
         truth=lambda patch, decoded, height_scale: np.einsum(

@@ -178,7 +178,7 @@ QUESTIONS = (
         name="reconstruction",
         points=2,
         title="L_recon without decoding a patch",
-        expects="||a - D g||^2 = squares - 2 products . g + g . gram g, one number a patch; with "
+        expects="||a - D g||^2 = squares - 2 products . g + g . gram g, one number per patch; with "
         "squares = ||a||^2, products = D^T a and gram = D^T D no patch is decoded.",
         draw=_decoder,
         truth=lambda codes, squares, products, gram: _loss(codes, squares, products, gram),

@@ -193,7 +193,7 @@ QUESTIONS = (
             ),
         ),
         hints=(
-            "networkx.DiGraph with one edge a finite cost, then networkx.dijkstra_path_length.",
+            "networkx.DiGraph with one edge per finite cost, then networkx.dijkstra_path_length.",
             "The neighbour along k is (ix + STEPS[k][0], iy + STEPS[k][1]); skip it off the map.",
             "networkx.NetworkXNoPath (or a goal without edges) means infinity.",
         ),

@@ -187,7 +187,7 @@ QUESTIONS = (
             ),
         ),
         hints=(
-            "terms @ weights is one number a robot.",
+            "terms @ weights is one number per robot.",
             "np.maximum(..., 0.0) first, then times dt.",
         ),
     ),

@@ -85,7 +85,7 @@ QUESTIONS = (
                 ),
             ),
             Mistake(
-                "up and down exchanged: who does well moves on to harder ground.",
+                "up and down exchanged: a robot that does well moves on to harder ground.",
                 lambda row, mean, failed, last: np.clip(row - _moves(mean, failed), 0, last),
             ),
             Mistake(
@@ -94,7 +94,7 @@ QUESTIONS = (
             ),
         ),
         hints=(
-            "Two masks: who moves up, who moves down.",
+            "Two masks: the robots that move up, and those that move down.",
             "row + up - down, with up.astype(int), then np.clip.",
         ),
     ),

@@ -89,7 +89,7 @@ QUESTIONS = (
             ),
         ),
         hints=(
-            "One number a trial first, then the mean over all of them.",
+            "One number per trial first, then the mean over all of them.",
             "success * reference / np.maximum(length, reference)",
         ),
     ),

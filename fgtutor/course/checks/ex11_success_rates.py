@@ -1,4 +1,4 @@
-"""Exercise 11, "Mixed terrain": success tables with intervals, and who walked where (Sec. IV-B)."""
+"""Exercise 11, "Mixed terrain": success tables with intervals, metres per policy (Sec. IV-B)."""
 
 import numpy as np
 
@@ -150,7 +150,7 @@ QUESTIONS = (
             ),
         ),
         hints=(
-            "One mask a pair: (terrain == i) & (policy == j).",
+            "One mask per pair: (terrain == i) & (policy == j).",
             "The mean of (outcome[mask] == 0) is the rate; an empty mask has none.",
         ),
     ),

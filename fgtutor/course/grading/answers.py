@@ -1,4 +1,4 @@
-"""Plain values: how answers travel from one process to another, and how two of them differ.
+"""Answers as plain values: how they pass from one process to another, and how two of them differ.
 
 Reads numbers, text, arrays and lists of these; gives JSON, never a pickle, and text that shows what
 differs. What does not reduce to plain numbers is refused, so an object with opinions about `==` is

@@ -1,4 +1,4 @@
-"""What a submission's process may still do: compute and read Python's own files, and nothing else.
+"""Confine a submission's process: it may compute and read Python's own files, and nothing else.
 
 Reads limits; changes the calling process for good and gives the names of the protections in force.
 Four layers: resource limits (POSIX), a Landlock domain in which the kernel opens nothing but
@@ -25,7 +25,7 @@ from pathlib import Path
 
 NO_NEW_PROCESS, FILES_UNREAD = "no new process", "other files unread"
 WALLS = frozenset({NO_NEW_PROCESS, FILES_UNREAD})
-"""The protections that only a kernel gives, and that hold against anybody: seccomp and Landlock."""
+"""The protections that only a kernel gives and Python cannot get around: seccomp and Landlock."""
 
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 """Flags of `open` that could change a file."""
@@ -89,7 +89,7 @@ _REFUSED = frozenset(
         "ctypes.dlopen",
     )
 )
-"""Audit events of what a submission has no business doing."""
+"""Audit events that are refused."""
 
 
 def confine(*, grader: int, memory_mb: int, cpu_seconds: float) -> list[str]:

@@ -1,4 +1,4 @@
-"""Grading: from submitted notebooks to marks, one process a submission, none of them trusted.
+"""Grading: from submitted notebooks to marks, one process per submission, none of them trusted.
 
 Reads .ipynb files and a seed; gives a `Mark` each, and on request a CSV, Gradescope's JSON and a
 report per learner. What a submission sends are answers, as plain JSON; right or wrong is decided
@@ -59,7 +59,7 @@ class GradeConfig:
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Notebooks, or folders of notebooks."""
     csv: Path | None = None
-    """Write one row a notebook here."""
+    """Write one row per notebook here."""
     gradescope: Path | None = None
     """Write Gradescope's results.json here."""
     reports: Path | None = None
@@ -185,11 +185,7 @@ def _read(notebooks: Sequence[Path], config: GradeConfig) -> list[tuple[Mark, li
 
 
 def _grade(
-    mark: Mark,
-    cells: list[str],
-    examiners: Mapping[str, Examiner],
-    limits: Limits,
-    stop: Event,
+    mark: Mark, cells: list[str], examiners: Mapping[str, Examiner], limits: Limits, stop: Event
 ) -> Mark:
     if mark.fault:
         return mark

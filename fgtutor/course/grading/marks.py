@@ -2,7 +2,7 @@
 
 Reads verdicts; gives plain text. Nothing that a submission wrote is passed on as HTML, as a
 terminal command or as a spreadsheet formula. Of one learner and exercise at most one notebook
-counts; all others have no points, so that sums are right whoever adds them up.
+counts; all others have no points, so that every sum over notebooks is right.
 """
 
 import csv
@@ -34,7 +34,7 @@ class Mark:
     exercise: str = ""
     """Such as "ex04"; empty if it could not be told."""
     verdicts: tuple[Verdict, ...] = ()
-    """One a question, in order."""
+    """One per question, in order."""
     fault: str = ""
     """Why it could not be graded at all."""
     notes: tuple[str, ...] = ()
@@ -129,7 +129,7 @@ def report(marks: Sequence[Mark]) -> str:
 
 
 def table(marks: Sequence[Mark]) -> str:
-    """Return the marks as CSV, one row a notebook."""
+    """Return the marks as CSV, one row per notebook."""
     widest = max((len(mark.verdicts) for mark in marks), default=0)
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")

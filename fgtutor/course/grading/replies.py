@@ -31,9 +31,8 @@ class TooSlow(BaseException):
 def time_limit(seconds: float, patience: float = PATIENCE) -> Iterator[None]:
     """Raise `TooSlow` in the block after `seconds` of CPU time, or `patience` times that by clock.
 
-    With patience 0 the clock does not count: someone else watches whether the block sleeps.
-
-    Where there are no such timers (Windows, threads) there is no limit: interrupt the kernel.
+    With patience 0 the clock does not count: the grader watches whether the process sleeps. Where
+    there are no such timers (Windows, threads) there is no limit: interrupt the kernel.
     """
     in_main = threading.current_thread() is threading.main_thread()
     if not (in_main and hasattr(signal, "setitimer")):

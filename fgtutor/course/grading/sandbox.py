@@ -1,4 +1,4 @@
-"""One submission in a process of its own: what it answers, whatever it does.
+"""Run one submission in a process of its own and collect its replies, whatever it does.
 
 Reads the notebook's cells and the cases of its questions; gives a reply for each question. The
 process has its own group, a scrubbed environment and limits (`confinement`); it sends plain JSON

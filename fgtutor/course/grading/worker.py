@@ -1,7 +1,7 @@
 """The process of one submission: run its cells, ask its functions, send back plain values.
 
-Reads a job as JSON from stdin; gives one JSON line a question on stdout. Started by `sandbox`, with
-nothing inherited. What it sends is not trusted by anyone: no verdict is made here.
+Reads a job as JSON from stdin; gives one JSON line per question on stdout. `sandbox` starts it with
+nothing inherited. The grader does not trust what it sends: no verdict is made here.
 """
 
 import importlib
