@@ -17,10 +17,12 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
+from fgtutor import directions
 from fgtutor.baselines import AssessedMap, find_route, without_ood
 from fgtutor.errors import ConfigError
 from fgtutor.execution import Episode, FollowConfig, execute_batch
 from fgtutor.io.validation import Positive, check_arguments
+from fgtutor.planning import plan
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.routes import Route
 from fgtutor.specialist import Specialist
@@ -46,22 +48,14 @@ class Scripted:
 
 
 def straight_route(terrain: Terrain, name: str) -> Route:
-    """Return the route that goes from start to goal along x as the crow flies, with one policy."""
-    grid = terrain.elevation
-    (first, row), (last, _) = grid.cell_of(*terrain.start), grid.cell_of(*terrain.goal)
-    ix = np.arange(first, last + 1)
-    cells = np.column_stack((ix, np.full_like(ix, row)))
-    steps = len(ix) - 1
-    return Route(
-        cells=cells,
-        xy=np.array([grid.centre_of(i, row) for i in ix.tolist()]),
-        headings=np.zeros(steps, dtype=int),
-        policies=np.zeros(steps, dtype=int),
-        feasibility=np.ones(steps),
-        costs=np.ones(steps),
-        length=steps * grid.resolution,
-        names=(name,),
-    )
+    """Return the route from start to goal along x, driven by one policy.
+
+    Raises `PlanningError` if the goal does not lie straight ahead.
+    """
+    grid, start, goal = terrain.elevation, terrain.start, terrain.goal
+    ahead = np.zeros((*grid.shape, directions.NUM_HEADINGS))
+    ahead[..., 0] = 1.0
+    return plan(ahead, 0 * ahead, grid=grid, start=start, goal=goal, names=(name,)).raise_for()
 
 
 def collect(

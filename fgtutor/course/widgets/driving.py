@@ -13,12 +13,13 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from fgtutor.directions import NUM_HEADINGS
 from fgtutor.errors import ConfigError
 from fgtutor.execution import Episode
 from fgtutor.figures.toy_film import ToyFilm
+from fgtutor.planning import plan
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.routes import Route
 from fgtutor.specialist import Specialist
 from fgtutor.world.terrain import Terrain, World
 
@@ -135,18 +136,12 @@ class Drive:
         if self._render is not None:
             return np.asarray(self._render(self.env))
         episode = self.episode
-        # The film colours policies by the names of a route, and nobody has planned one.
-        nowhere = Route(
-            cells=np.zeros((1, 2), dtype=int),
-            xy=episode.poses[:1, :2],
-            headings=np.zeros(0, dtype=int),
-            policies=np.zeros(0, dtype=int),
-            feasibility=np.zeros(0),
-            costs=np.zeros(0),
-            length=0.0,
-            names=tuple(self.zoo),
-        )
-        return np.asarray(ToyFilm(episode, self.terrain, nowhere).side(len(episode.poses) - 1))
+        # The film colours policies by the names of a route: one that stays where it starts.
+        grid, here = self.terrain.elevation, self.terrain.start
+        closed = np.zeros((*grid.shape, NUM_HEADINGS))
+        stay = plan(closed, closed, grid=grid, start=here, goal=here, names=tuple(self.zoo))
+        film = ToyFilm(episode, self.terrain, stay.raise_for())
+        return np.asarray(film.side(len(episode.poses) - 1))
 
     @property
     def status(self) -> str:

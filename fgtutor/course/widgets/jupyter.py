@@ -83,8 +83,8 @@ class Canvas(anywidget.AnyWidget):
 class _Board(w.VBox):
     """Controls above a canvas; handles what a person does and shows what became of it."""
 
-    def __init__(self, controls: list[w.Widget]) -> None:
-        self.view = Canvas()
+    def __init__(self, controls: list[w.Widget], model: Explorer | Painting) -> None:
+        self.view, self._model = Canvas(), model
         self._hovered: Cell | None = None
         super().__init__([*controls, self.view])
         self.view.on_msg(self._on_message)
@@ -111,10 +111,7 @@ class _Board(w.VBox):
             self._reread()
 
     def _reread(self) -> None:
-        self.view.reading = "" if self._hovered is None else self._read(self._hovered)
-
-    def _read(self, cell: Cell) -> str:
-        raise NotImplementedError
+        self.view.reading = "" if self._hovered is None else self._model.read(self._hovered)
 
     def _act(self, content: dict[str, Any], cells: list[Cell]) -> None:
         raise NotImplementedError
@@ -179,7 +176,7 @@ class TauExplorer(_Board):
         sliders = w.VBox([self.taus, self.f_min, self.switch_cost])
         boxes = w.HBox(list(self.policies.values()))
         named = w.HBox([w.Label("settings"), *self.named.values()])
-        super().__init__([w.HBox([sliders, w.VBox([boxes, named, self.picks])])])
+        super().__init__([w.HBox([sliders, w.VBox([boxes, named, self.picks])])], self.explorer)
         self._change()
 
     def _on_taus(self, change: Any) -> None:
@@ -209,9 +206,6 @@ class TauExplorer(_Board):
             cells = [(int(moved[0]), int(moved[1]))]
         self._change(**{role: elevation.centre_of(*cells[-1])})
 
-    def _read(self, cell: Cell) -> str:
-        return self.explorer.read(cell)
-
 
 class TerrainPainter(_Board):
     """Paint heights, and see F change: only the cells whose patch saw the stroke are assessed."""
@@ -235,7 +229,9 @@ class TerrainPainter(_Board):
         self.clear = w.Button(description="clear")
         self.heading.observe(self._on_heading, "value")
         self.clear.on_click(self._on_clear)
-        super().__init__([self.height, self.radius, w.HBox([self.heading, self.clear])])
+        super().__init__(
+            [self.height, self.radius, w.HBox([self.heading, self.clear])], self.painting
+        )
         self._present(self.painting.scene())
 
     def paint(self, cells: list[Cell]) -> None:
@@ -254,9 +250,6 @@ class TerrainPainter(_Board):
     def _act(self, content: dict[str, Any], cells: list[Cell]) -> None:
         if cells:
             self.paint(cells)
-
-    def _read(self, cell: Cell) -> str:
-        return self.painting.read(cell)
 
 
 class DriveA1(w.VBox):

@@ -22,7 +22,7 @@ from fgtutor.figures.maps import BLOCKED, UNKNOWN, relief
 
 Cell = tuple[int, int]
 Point = tuple[float, float]
-CIVIDIS = (matplotlib.colormaps["cividis"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
+CIVIDIS = matplotlib.colormaps["cividis"]
 """Colours of F: they differ in brightness too, so the colour-blind read them alike."""
 
 
@@ -47,7 +47,7 @@ class Scene:
     rows: Sequence[Sequence[Panel]]
     """The panels, row by row; those of a row share its width."""
     pictures: Mapping[str, UInt8[np.ndarray, "ny nx 3"]]
-    """One colour a cell, upright, by panel key."""
+    """One colour per cell, upright, by panel key."""
     lines: Sequence[tuple[str, Sequence[Point]]] = field(default_factory=tuple)
     """Polylines over every panel: a colour and points (right, down), in cells."""
     marks: Mapping[str, Point] = field(default_factory=dict)
@@ -70,44 +70,26 @@ def on_picture(cells: Float[np.ndarray, "n 2"], ny: int) -> list[Point]:
     return [(ix + 0.5, ny - iy - 0.5) for ix, iy in np.asarray(cells).tolist()]
 
 
-def shades(low: str, high: str) -> UInt8[np.ndarray, "256 3"]:
-    """Return 256 colours from one to another."""
-    way = np.linspace(0, 1, 256)[:, None]
-    return (((1 - way) * to_rgb(low) + way * to_rgb(high)) * 255).round().astype(np.uint8)
-
-
-def level(values: Float[np.ndarray, "nx ny"]) -> UInt8[np.ndarray, "nx ny"]:
-    """Return values in [0, 1] as indices into 256 colours."""
-    return (values * 255 + 0.5).astype(np.uint8)
+def picture(
+    colours: Float[np.ndarray, "nx ny 3"], known: Bool[np.ndarray, "nx ny"]
+) -> UInt8[np.ndarray, "ny nx 3"]:
+    """Turn one colour per cell into a picture; cells that were never observed are grey."""
+    shown = np.where(known[..., None], colours, to_rgb(UNKNOWN))
+    return upright((shown * 255).round().astype(np.uint8))
 
 
 def feasibility_picture(
     best: Float[np.ndarray, "nx ny"], known: Bool[np.ndarray, "nx ny"], f_min: float
 ) -> UInt8[np.ndarray, "ny nx 3"]:
-    """Colour F, one number a cell; dark where it is below `f_min`."""
-    picture = CIVIDIS[upright(level(best))]
-    picture[upright(best < f_min)] = rgb(BLOCKED)
-    return mark_unknown(picture, known)
+    """Colour F, one number per cell; dark where it is below `f_min`."""
+    colours = CIVIDIS(best)[..., :3]
+    colours[best < f_min] = to_rgb(BLOCKED)
+    return picture(colours, known)
 
 
 def ground_picture(elevation: ElevationMap) -> UInt8[np.ndarray, "ny nx 3"]:
-    """Colour the heights of a map exactly as `figures.draw_elevation` does."""
-    colours, _ = relief(elevation)
-    return mark_unknown(upright((colours * 255).round().astype(np.uint8)), elevation.known)
-
-
-def mark_unknown(
-    picture: UInt8[np.ndarray, "ny nx 3"], known: Bool[np.ndarray, "nx ny"]
-) -> UInt8[np.ndarray, "ny nx 3"]:
-    """Grey out the cells that were never observed, in place; return the picture."""
-    if not known.all():
-        picture[upright(~known)] = rgb(UNKNOWN)
-    return picture
-
-
-def rgb(colour: str) -> UInt8[np.ndarray, "3"]:
-    """Return a colour by name or #RRGGBB as three bytes."""
-    return (np.array(to_rgb(colour)) * 255).round().astype(np.uint8)
+    """Colour the heights of a map as `figures.maps.draw_elevation` does."""
+    return picture(relief(elevation)[0], elevation.known)
 
 
 def check_cell(elevation: ElevationMap, cell: Cell) -> None:
@@ -120,7 +102,7 @@ def check_cell(elevation: ElevationMap, cell: Cell) -> None:
 def cell_table(
     elevation: ElevationMap, cell: Cell, rows: Mapping[str, Sequence[float] | Sequence[str]]
 ) -> str:
-    """Say what is known of a cell: its place and height, then eight values a row, by heading."""
+    """Say where a cell is and how high, then eight values by heading for each label of `rows`."""
     x, y = elevation.centre_of(*cell)
     height = f"height {elevation.heights[cell]:.2f} m"
     known = height if elevation.known[cell] else "never observed: closed"

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
+from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 
 from fgtutor.course.widgets.explorer import Explorer
@@ -18,12 +19,8 @@ from fgtutor.course.widgets.panels import (
     Scene,
     feasibility_picture,
     ground_picture,
-    level,
-    mark_unknown,
     on_picture,
-    rgb,
-    shades,
-    upright,
+    picture,
 )
 from fgtutor.feasibility import TAU_HIGH, TAU_LOW
 from fgtutor.figures.maps import BLOCKED, draw_policy_map, draw_route, draw_weight
@@ -51,28 +48,26 @@ class TauPictures:
         self.explorer = explorer
         self.colours = policy_colours(explorer.names)
         self._ground = ground_picture(explorer.elevation)
-        self._shades = {name: shades("white", colour) for name, colour in self.colours.items()}
-        # As in `draw_policy_map`: a fifth of the colour where F is 0, all of it where F is 1.
-        strength = np.linspace(0.2 * 255, 255, 256).round().astype(int)
-        self._tints = np.stack([own[strength] for own in self._shades.values()])
+        self._palette = np.array([to_rgb(colour) for colour in self.colours.values()])
 
     def scene(self) -> Scene:
         """Draw the explorer as it stands."""
         explorer = self.explorer
         f_min, known = explorer.settings.f_min, explorer.elevation.known
         best, policy = explorer.best
-        chosen = self._tints[upright(policy), upright(level(best))]
-        chosen[upright(best < f_min)] = rgb(BLOCKED)
+        # As in `draw_policy_map`: a fifth of the colour where F is 0, all of it where F is 1.
+        chosen = 1 - (0.2 + 0.8 * best[..., None]) * (1 - self._palette[policy])
+        chosen[best < f_min] = to_rgb(BLOCKED)
         pictures = {
             "M": self._ground,
             "F": feasibility_picture(best, known, f_min),
-            "P": mark_unknown(chosen, known),
+            "P": picture(chosen, known),
         }
         weights = []
-        for name, weight in explorer.weights.items():
+        for colour, (name, weight) in zip(self._palette, explorer.weights.items(), strict=True):
             key = f"w {name}"
-            picture = self._shades[name][upright(level(weight.mean(dim=-1).numpy()))]
-            pictures[key] = mark_unknown(picture, known)
+            mean = weight.mean(dim=-1, keepdim=True).numpy()
+            pictures[key] = picture(1 - mean * (1 - colour), known)
             weights.append(
                 Panel(
                     key=key,
@@ -97,7 +92,7 @@ class TauPictures:
         return on_picture(np.asarray(cells), self.explorer.elevation.shape[1])
 
     def _lines(self) -> list[tuple[str, list[Point]]]:
-        """Cut the route where the policy changes: one polyline a stretch, in its colour."""
+        """Cut the route where the policy changes: one polyline per stretch, in its colour."""
         route = self.explorer.route
         if route is None or not len(route.policies):
             return []
@@ -114,8 +109,8 @@ def tau_figure(
 ) -> Picture:
     """Draw what each choice of taus makes of the map, side by side: a page without sliders.
 
-    The upper row shows how well the policy that knows a cell best knows it. The explorer is left as
-    it was. Raises `ThresholdError` for taus that are not tau_low <= tau_high.
+    The upper row shows the largest w_ood of all policies. The explorer is left as it was. Raises
+    `ThresholdError` for taus that are not tau_low < tau_high.
     """
     before, elevation = explorer.settings.taus, explorer.elevation
     aspect = elevation.size[1] / elevation.size[0]
@@ -137,17 +132,16 @@ def tau_figure(
                 explorer.names,
                 f_min=explorer.settings.f_min,
                 axes=below,
+                bare=True,
             )
             said = "no route: not enough ground is known"
             if explorer.route is not None:
-                draw_route(explorer.route, elevation, axes=below)
+                draw_route(explorer.route, elevation, axes=below, bare=True)
                 said = explorer.status.split(": ", 1)[1].split(" (")[0]
             below.set_title("P and the route", **TITLE, loc="left")
             below.set_xlabel(f"x (m)\n{said}", fontsize=9)
     finally:
         explorer.update(taus=before)
-    # Every panel brought a legend of its own, and they would lie on top of each other.
-    figure.legends.clear()
     colours = policy_colours(explorer.names) | {"blocked": BLOCKED}
     figure.legend(
         handles=[Patch(color=colour, label=name) for name, colour in colours.items()],
