@@ -1,4 +1,4 @@
-"""How an A1 is set up, and how every robot of a batch is made a little different from the others.
+"""How an A1 is set up, and how the robots of a batch are made to differ from one another.
 
 Reads `A1EnvConfig`; writes masses, frictions and gains into the simulations of a `Physics`.
 """
