@@ -6,7 +6,7 @@ from matplotlib.colors import to_rgb
 
 from fgtutor.course.widgets.driving import Drive
 from fgtutor.errors import ConfigError
-from fgtutor.figures import maps
+from fgtutor.figures import style
 from fgtutor.world.terrain import make_terrain
 
 
@@ -56,7 +56,7 @@ def test_a_toy_draws_itself_and_others_are_drawn(make_rolling, make_specialist):
     terrain, zoo = make_terrain("flat", robot="toy"), {"steps": make_rolling()}
     frame = Drive(terrain, zoo).frame()
     assert frame.shape == (272, 720, 3)
-    blue = np.array(to_rgb(maps.POLICY_COLOURS["steps"])) * 255
+    blue = np.array(to_rgb(style.POLICY_COLOURS["steps"])) * 255
     assert (np.abs(frame - blue).max(axis=-1) < 3).sum() > 1000
     drive = Drive(terrain, zoo, render=lambda env: np.full((4, 6, 3), env.num_envs, np.uint8))
     assert drive.frame().tolist() == np.ones((4, 6, 3)).tolist()

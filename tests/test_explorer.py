@@ -13,7 +13,7 @@ from fgtutor.course.widgets.panels import on_picture, upright
 from fgtutor.course.widgets.tau_pictures import TAU_CHOICES, TauPictures, tau_figure
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, OffMapError, ThresholdError
-from fgtutor.figures import maps
+from fgtutor.figures import maps, style
 from fgtutor.planning import plan_on_map
 from fgtutor.settings import PAPER, PlanSettings
 from fgtutor.tensorization import Assessment
@@ -214,8 +214,8 @@ def test_a_route_is_cut_where_the_policy_changes():
     explorer = Explorer(grid, said, (0.05, 0.05), (0.35, 0.05), switch_cost=0.0)
     scene = TauPictures(explorer).scene()
     assert list(scene.lines) == [
-        (maps.POLICY_COLOURS["steps"], [(0.5, 1.5), (1.5, 1.5), (2.5, 1.5)]),
-        (maps.POLICY_COLOURS["gaps"], [(2.5, 1.5), (3.5, 1.5)]),
+        (style.POLICY_COLOURS["steps"], [(0.5, 1.5), (1.5, 1.5), (2.5, 1.5)]),
+        (style.POLICY_COLOURS["gaps"], [(2.5, 1.5), (3.5, 1.5)]),
     ]
     assert scene.marks == {"start": (0.5, 1.5), "goal": (3.5, 1.5)}
     explorer.update(goal=explorer.start)

@@ -19,7 +19,7 @@ from PIL import Image
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, StorageError
 from fgtutor.execution import Episode
-from fgtutor.figures import charts, maps, toy_film, videos
+from fgtutor.figures import charts, maps, style, toy_film, videos
 from fgtutor.fusion import fuse
 from fgtutor.planning import Plan, plan
 from fgtutor.statistics import Share, calibration
@@ -134,7 +134,7 @@ def test_any_map_can_be_drawn(heights):
 def test_a_route_has_the_colours_of_its_policies(ground, planned):
     figure = maps.draw_route(planned.route, ground)
     _, line = (c for c in figure.axes[0].collections if isinstance(c, LineCollection))
-    expected = [to_rgb(maps.POLICY_COLOURS[NAMES[p]]) for p in planned.route.policies]
+    expected = [to_rgb(style.POLICY_COLOURS[NAMES[p]]) for p in planned.route.policies]
     np.testing.assert_allclose(line.get_colors()[:, :3], expected)
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["steps", "gaps", "start", "goal"]
@@ -146,9 +146,9 @@ def test_a_route_of_one_cell_can_be_drawn(ground, planned):
 
 
 def test_strangers_keep_apart_from_the_known():
-    colours = maps.policy_colours(["ice", "steps", "sand"])
-    assert colours["steps"] == maps.POLICY_COLOURS["steps"]
-    assert len({*colours.values(), *maps.POLICY_COLOURS.values()}) == 9
+    colours = style.policy_colours(["ice", "steps", "sand"])
+    assert colours["steps"] == style.POLICY_COLOURS["steps"]
+    assert len({*colours.values(), *style.POLICY_COLOURS.values()}) == 9
 
 
 @pytest.mark.parametrize("kind", [np.asarray, torch.tensor])
@@ -157,7 +157,7 @@ def test_weight_is_white_where_a_policy_is_lost(ground, kind):
     w[7, 3] = 1.0
     figure = maps.draw_weight(kind(w), ground, "gaps")
     image = figure.axes[0].images[0].get_array()
-    np.testing.assert_allclose(image[3, 7], to_rgb(maps.POLICY_COLOURS["gaps"]))
+    np.testing.assert_allclose(image[3, 7], to_rgb(style.POLICY_COLOURS["gaps"]))
     np.testing.assert_allclose(image[3, 8], 1.0)
 
 
@@ -202,7 +202,7 @@ def test_the_policy_map_shows_who_is_best_and_what_is_closed(ground, planned):
     np.testing.assert_allclose(image[4, 2], to_rgb(maps.BLOCKED))
     # F = 0.9 gives the strength 0.2 + 0.8 * 0.9 = 0.92 between white and the policy's colour.
     for ix, name in ((10, "steps"), (30, "gaps")):
-        colour = np.array(to_rgb(maps.POLICY_COLOURS[name]))
+        colour = np.array(to_rgb(style.POLICY_COLOURS[name]))
         np.testing.assert_allclose(image[4, ix], 1 - 0.92 * (1 - colour))
 
 
@@ -211,7 +211,7 @@ def test_the_plan_figure_has_every_panel(ground, planned, tmp_path):
     figure = maps.plan_figure(ground, replace(planned, weights=weights))
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert [t for t in titles if t and t[0] in "134"] and {"steps", "gaps"} <= set(titles)
-    path = maps.save_figure(figure, tmp_path / "plan.png", dpi=50)
+    path = style.save_figure(figure, tmp_path / "plan.png", dpi=50)
     with Image.open(path) as image:
         assert image.width > 500
     with pytest.raises(ConfigError, match="gaps"):
@@ -337,7 +337,7 @@ def test_the_side_view_shows_the_robot_in_its_policys_colour(episode, terrain, p
         image = np.asarray(film.side(t)).astype(float)
         # The chassis' centre lies above s = 0, at the camera's height: z = 0.3 everywhere.
         u, v = round(toy_film.BEHIND * toy_film.SCALE), round(0.5 * toy_film.SIDE[1])
-        colour = 255 * np.array(to_rgb(maps.POLICY_COLOURS[name]))
+        colour = 255 * np.array(to_rgb(style.POLICY_COLOURS[name]))
         assert np.abs(image[v, u] - colour).max() < 2
 
 
@@ -397,7 +397,7 @@ def test_an_episode_of_one_step_is_a_film(episode, terrain, planned):
 @pytest.mark.parametrize("name", ["plan.docx", "plan"])
 def test_an_unknown_suffix_is_refused(ground, tmp_path, name):
     with pytest.raises(ConfigError, match="png"):
-        maps.save_figure(maps.draw_elevation(ground), tmp_path / name)
+        style.save_figure(maps.draw_elevation(ground), tmp_path / name)
 
 
 def test_a_video_of_another_format_is_refused(episode, terrain, planned, tmp_path):
@@ -416,7 +416,7 @@ def test_a_full_disk_leaves_nothing(
     path = tmp_path / f"picture.{suffix}"
     with pytest.raises(StorageError, match="free some disk space"):
         if suffix == "png":
-            maps.save_figure(maps.draw_elevation(ground), path)
+            style.save_figure(maps.draw_elevation(ground), path)
         else:
             videos.save_video(episode, terrain, planned.route, path)
     assert not list(tmp_path.iterdir())

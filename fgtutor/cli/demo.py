@@ -14,7 +14,8 @@ import torch
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import RenderingError
 from fgtutor.execution import FollowConfig, execute
-from fgtutor.figures.maps import plan_figure, save_figure
+from fgtutor.figures.maps import plan_figure
+from fgtutor.figures.style import save_figure
 from fgtutor.figures.videos import film_strip, save_video
 from fgtutor.io.progress import waiting
 from fgtutor.io.storage import atomic_write, make_folder, write_json

@@ -10,7 +10,7 @@ Arrays are [ix, iy], but an image has y first: the transposes are here and nowhe
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,13 +22,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
-from matplotlib.ticker import FixedLocator, FuncFormatter
 from numpy.typing import ArrayLike
 
 from fgtutor import directions
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.figures.style import POLICY_COLOURS, TITLE, Picture, policy_colours, save_figure
+from fgtutor.figures.style import TITLE, Picture, policy_colours
 from fgtutor.io.validation import Count, check_arguments
 
 if TYPE_CHECKING:
@@ -36,24 +35,10 @@ if TYPE_CHECKING:
     from fgtutor.routes import Route
     from fgtutor.world.terrain import Section
 
-__all__ = [
-    "POLICY_COLOURS",
-    "Picture",
-    "draw_elevation",
-    "draw_petals",
-    "draw_plans",
-    "draw_policy_map",
-    "draw_route",
-    "draw_weight",
-    "plan_figure",
-    "policy_colours",
-    "save_figure",
-]
-
 HEADING_COLOURS = (
     "#E69F00", "#B8A23A", "#009E73", "#56B4E9", "#0072B2", "#6F6DAE", "#CC79A7", "#D55E00",
 )  # fmt: skip
-"""One colour a heading, in a circle: neighbours resemble each other."""
+"""One colour per heading, in a circle: neighbours resemble each other."""
 BLOCKED, UNKNOWN = "#33363B", "#C4C4C4"
 """Cells that no policy may leave, and cells that were never observed."""
 FEASIBLE, CLOSED = "#0072B2", "#D9D9D9"
@@ -64,6 +49,9 @@ GROUND = LinearSegmentedColormap.from_list(
 """Below the usual ground blue, above it brown; level ground is light, so that routes stand out."""
 DETAIL = 0.1
 """Heights within this many metres of the usual ground get the larger part of the colours."""
+HEIGHT: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 8, "color": "white"}
+HEIGHT["path_effects"] = [Stroke(linewidth=3, foreground=BLOCKED), Normal()]
+"""How heights are written on a map."""
 GLYPHS = 36
 """Petal glyphs along the longer side of a map: more could not be told apart."""
 
@@ -100,16 +88,20 @@ def draw_elevation(
     _hatch_unknown(axes, elevation)
     if bare:
         return _root(axes)
-    bar = _root(axes).colorbar(ScalarMappable(norm, GROUND), ax=axes, shrink=0.8, pad=0.01)
     low, high = norm.vmin or 0.0, norm.vmax or 0.0
     usual, reach = (high + low) / 2, (high - low) / 2
     marks = np.array([0.05, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
     marks = marks[marks <= reach * 1.001][-4:]
-    bar.locator = FixedLocator([*(usual - marks), usual, *(usual + marks)])
-    bar.formatter = FuncFormatter(lambda z, _: f"{z:.2f}")
-    bar.update_ticks()
+    bar = _root(axes).colorbar(
+        ScalarMappable(norm, GROUND),
+        ax=axes,
+        shrink=0.8,
+        pad=0.01,
+        label="height (m)",
+        ticks=[*(usual - marks), usual, *(usual + marks)],
+        format="%.2f",
+    )
     bar.ax.minorticks_off()
-    bar.set_label("height (m)")
     _say(axes, "Elevation map M", "Blue lies below the usual ground, brown above it")
     return _root(axes)
 
@@ -126,11 +118,8 @@ def draw_route(
     if not bare:
         used = {name: colours[name] for i, name in enumerate(route.names) if i in route.policies}
         _legend(axes, used, ends)
-        _say(
-            axes,
-            "The route, coloured by the policy that drives it",
-            f"{route.length:.1f} m, cost {route.cost:.1f}, policy switches: {route.switches}",
-        )
+        caption = f"{route.length:.1f} m, cost {route.cost:.1f}, policy switches: {route.switches}"
+        _say(axes, "The route, coloured by the policy that drives it", caption)
     return _root(axes)
 
 
@@ -164,7 +153,7 @@ def draw_petals(
     every: Count | None = None,
     axes: Axes | None = None,
 ) -> Figure:
-    """Draw a tensor F [nx, ny, 8] as one flower a cell: a petal's length is F along its heading.
+    """Draw a tensor F [nx, ny, 8] as one flower per cell: a petal's length is F along its heading.
 
     With `policy_map` and `names` petals have the colour of the best policy, else of their heading.
     `every` draws every n-th cell along x and y, by default as few as can be told apart.
@@ -189,24 +178,20 @@ def draw_petals(
     if policy_map is None:
         palette = np.array([to_rgb(colour) for colour in HEADING_COLOURS])
         kind = np.broadcast_to(np.arange(directions.NUM_HEADINGS), f.shape)
-        caption = "One colour a heading"
+        caption = "One colour per heading"
     else:
         palette = _palette(names)
         kind = _policies(policy_map, grid, names)[at]
         _legend(axes, policy_colours(names))
         caption = "In the colour of the policy that does it best"
-    axes.add_collection(
-        PolyCollection(list(petals[open_]), facecolors=palette[kind[open_]], linewidths=0)
-    )
+    flowers = PolyCollection(list(petals[open_]), facecolors=palette[kind[open_]], linewidths=0)
+    axes.add_collection(flowers)
     closed = centres[~open_.any(axis=-1)]
     axes.plot(*closed.T, ".", color=BLOCKED, markersize=2.5)
     _hatch_unknown(axes, grid)
     which = "every cell" if every == 1 else f"one cell in {every} x {every}"
-    _say(
-        axes,
-        "F as petals: the longer a petal, the better that way",
-        f"{caption}; {which}. A dot: no way out",
-    )
+    title = "F as petals: the longer a petal, the better that way"
+    _say(axes, title, f"{caption}; {which}. A dot: no way out")
     return _root(axes)
 
 
@@ -233,11 +218,8 @@ def draw_policy_map(
     _hatch_unknown(axes, grid)
     if not bare:
         _legend(axes, policy_colours(names) | ({"blocked": BLOCKED} if blocked.any() else {}))
-        _say(
-            axes,
-            "Policy map P: the best policy in each cell",
-            f"Paler: less feasible. Blocked: no heading reaches F = {f_min:g}",
-        )
+        caption = f"Paler: less feasible. Blocked: no heading reaches F = {f_min:g}"
+        _say(axes, "Policy map P: the best policy in each cell", caption)
     return _root(axes)
 
 
@@ -260,10 +242,8 @@ def plan_figure(elevation: ElevationMap, plan: Plan, *, f_min: float = 0.1) -> P
     columns = int(np.ceil(np.sqrt(len(plan.names))))
     rows = -(-len(plan.names) // columns)
     panels[0, 1].suptitle("2  Have I seen this before? w_ood of each policy", **TITLE, x=0.02)
-    panels[0, 1].supxlabel(
-        "Full colour (1): the policy knows such ground. White (0): not at all",
-        fontsize=9,
-    )
+    caption = "Full colour (1): the policy knows such ground. White (0): not at all"
+    panels[0, 1].supxlabel(caption, fontsize=9)
     small = panels[0, 1].subplots(rows, columns, squeeze=False).ravel()
     for axes, name in zip(small, plan.names, strict=False):
         draw_weight(weights[name], elevation, name, axes=axes, bare=True)
@@ -306,16 +286,8 @@ def draw_plans(
             corner, size = (place.x0, place.y0), (place.x1 - place.x0, place.y1 - place.y0)
             axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=BLOCKED))
             top = elevation.crop(place.x0, place.y0, place.x1, place.y1).heights.max()
-            axes.text(
-                (place.x0 + place.x1) / 2,
-                place.y0 - 0.1,
-                f"{100 * top:.0f} cm high",
-                ha="center",
-                va="top",
-                fontsize=8,
-                color="white",
-                path_effects=[Stroke(linewidth=3, foreground=BLOCKED), Normal()],
-            )
+            middle, below = (place.x0 + place.x1) / 2, place.y0 - 0.1
+            axes.text(middle, below, f"{100 * top:.0f} cm high", **HEIGHT)
         if route is not None:
             _paint_route(axes, route, ["#D55E00"] * len(route.policies))
         found = "no route" if route is None else f"{route.length:.1f} m"
@@ -363,21 +335,14 @@ def _say(axes: Axes, title: str, caption: str) -> None:
 def _legend(axes: Axes, colours: Mapping[str, str], more: Sequence[Line2D] = ()) -> None:
     """Name colours below the picture."""
     handles = [Patch(color=colour, label=name) for name, colour in colours.items()]
-    panel = axes.get_figure(root=False)
+    panel, ncols = axes.get_figure(root=False), len(handles) + len(more)
     if panel is not None:
-        panel.legend(
-            handles=[*handles, *more],
-            loc="outside lower center",
-            ncols=len(handles) + len(more),
-            frameon=False,
-            fontsize=9,
-            columnspacing=1.2,
-            handlelength=1.2,
-        )
+        style = {"fontsize": 9, "columnspacing": 1.2, "handlelength": 1.2, "frameon": False}
+        panel.legend(handles=[*handles, *more], loc="outside lower center", ncols=ncols, **style)
 
 
 def _show(axes: Axes, grid: ElevationMap, colours: Float[np.ndarray, "nx ny 3"]) -> None:
-    """Show one colour a cell."""
+    """Show one colour per cell."""
     x0, y0, x1, y1 = grid.extent
     # An image is [row = y, column = x]: transpose; its first row lies at the bottom: origin lower.
     axes.imshow(
@@ -390,14 +355,11 @@ def _paint_route(axes: Axes, route: Route, colours: Sequence[str]) -> list[Line2
     edges = list(np.stack((route.xy[:-1], route.xy[1:]), axis=1))
     for line in ({"colors": "white", "linewidths": 6}, {"colors": colours, "linewidths": 3.2}):
         axes.add_collection(LineCollection(edges, capstyle="round", **line))
-    ends = []
-    for (x, y), marker, size, role in (
-        (route.xy[0], "o", 9, "start"),
-        (route.xy[-1], "*", 15, "goal"),
-    ):
-        style = {"marker": marker, "markersize": size, "color": "white", "markeredgecolor": "black"}
-        axes.plot([x], [y], linestyle="none", zorder=5, **style)
-        ends.append(Line2D([], [], linestyle="none", label=role, **style))
+    ends: list[Line2D] = []
+    style: dict[str, Any] = {"linestyle": "none", "color": "white", "markeredgecolor": "black"}
+    for at, role, marker, size in ((0, "start", "o", 9), (-1, "goal", "*", 15)):
+        x, y = route.xy[at]
+        ends += axes.plot([x], [y], label=role, marker=marker, markersize=size, zorder=5, **style)
     return ends
 
 
