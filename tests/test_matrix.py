@@ -142,6 +142,15 @@ def test_the_command_writes_rows_and_a_report_and_prints_a_table(config, capsys)
     assert line in again and "tasks to do" not in again
 
 
+def test_a_run_is_known_by_each_setting_and_not_by_how_it_was_given():
+    ours = MatrixConfig().run_settings("evaluate matrix")
+    assert MatrixConfig(switch_cost=1.0, taus="calibrated").run_settings("evaluate matrix") == ours
+    paper = MatrixConfig(settings="paper").run_settings("evaluate matrix")
+    assert {name for name in ours if ours[name] != paper[name]} == {
+        "taus", "cost", "switch_cost", "hold_steps",
+    }  # fmt: skip
+
+
 def test_evaluation_never_draws_a_training_seed():
     seeds = {terrain_seed(seed, trial) for seed in range(3) for trial in range(500)}
     assert len(seeds) == 1500 and all(seed % 2 == 1 for seed in seeds)

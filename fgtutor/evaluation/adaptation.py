@@ -27,7 +27,6 @@ from fgtutor.directions import NUM_HEADINGS
 from fgtutor.errors import TerrainError
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
-from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.success import terrain_seed
 from fgtutor.evaluation.tasks import Task
 from fgtutor.evaluation.trials import Ground, Outcome, PlannedConfig, by_cell, drive
@@ -308,7 +307,7 @@ def run(config: AdaptationConfig) -> int:
         config,
         title=f"Planning adapts to the policy ({config.robot})",
         tasks=tasks,
-        settings=settings_of(config, COMMAND, zoo=config.zoo_digests()),
+        settings=config.run_settings(COMMAND),
         cost=cost,
         find=find,
     )

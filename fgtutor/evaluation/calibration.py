@@ -24,7 +24,7 @@ from fgtutor.evaluation.trials import ZooConfig
 from fgtutor.feasibility import feasibility_labels, ood_weight
 from fgtutor.io.validation import NonNegative
 from fgtutor.robots import env_class
-from fgtutor.settings import SETTINGS
+from fgtutor.settings import SETTINGS, Taus
 from fgtutor.specialist import Specialist, load_zoo
 from fgtutor.statistics import calibration
 from fgtutor.tensorization import resolve_taus
@@ -47,6 +47,11 @@ class CalibrationConfig(ZooConfig):
     """Other thresholds than those of the settings."""
     relief: NonNegative = 0.06
     """A patch with at least this difference of heights is distinctive of its terrain, m."""
+
+    @property
+    def thresholds(self) -> Taus:
+        """The thresholds that these options choose."""
+        return self.taus or SETTINGS[self.settings].taus
 
     def load_zoo(self) -> dict[str, Specialist]:
         """Return the specialists."""
@@ -110,7 +115,6 @@ def drive(specialist: Specialist, terrain: str, config: CalibrationConfig) -> Dr
 def run_task(config: CalibrationConfig, name: str) -> list[CalibrationRow]:
     """Do one task: drive one specialist, and ask the Feasibility-Nets of all about what it met."""
     zoo = config.load_zoo()
-    taus = config.taus or SETTINGS[config.settings].taus
     driven = drive(zoo[name], zoo[name].provenance.get("terrain", name), config)
     relief = driven.patch.amax(dim=-1) - driven.patch.amin(dim=-1)
     distinctive = driven.patch[relief >= config.relief]
@@ -121,7 +125,9 @@ def run_task(config: CalibrationConfig, name: str) -> list[CalibrationRow]:
             return None
         with torch.inference_mode():
             loss = zoo[other].feasibility.reconstruction(patch)
-        return round(ood_weight(loss, *resolve_taus(taus, zoo[other])).mean().item(), 4)
+        return round(
+            ood_weight(loss, *resolve_taus(config.thresholds, zoo[other])).mean().item(), 4
+        )
 
     bins, error = calibration(driven.predicted, driven.measured)
     return [
@@ -160,7 +166,7 @@ def run(config: CalibrationConfig) -> int:
         samples = min(row["samples"] for row in rows)
         caption = (
             f"At least {samples:,} labelled patches each; robot {config.robot}, tau "
-            f"{config.taus or SETTINGS[config.settings].taus}, seed {config.seed}."
+            f"{config.thresholds}, seed {config.seed}."
         )
         return Findings(table=table(rows), caption=caption)
 
@@ -168,6 +174,12 @@ def run(config: CalibrationConfig) -> int:
         config,
         title=f"What Feasibility-Nets know ({config.robot})",
         tasks=[Task(name=name, function=run_task, arguments=(config, name)) for name in names],
-        settings=settings_of(config, COMMAND, zoo=config.zoo_digests()),
+        settings=settings_of(
+            config,
+            COMMAND,
+            without=("settings",),
+            taus=config.thresholds,
+            zoo=config.zoo_digests(),
+        ),
         find=find,
     )

@@ -16,7 +16,6 @@ from fgtutor.baselines import planners
 from fgtutor.evaluation import report
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.report import Findings
-from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.evaluation.trials import Ground, PlannedConfig, TrialRow, by_cell, drive
 from fgtutor.figures.charts import draw_shares
@@ -183,14 +182,8 @@ def run_and_report(
         config,
         title=title,
         tasks=make_tasks(config, terrains, policies, work),
-        settings=settings_of(
-            config,
-            command,
-            without=("trials",),
-            terrains=terrains,
-            policies=policies,
-            zoo=config.zoo_digests(),
-            **number,
+        settings=config.run_settings(
+            command, without=("trials",), terrains=terrains, policies=policies, **number
         ),
         cost=cost,
         find=find,

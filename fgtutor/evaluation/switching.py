@@ -22,7 +22,6 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import TerrainError
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
-from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.success import cut, terrain_seed
 from fgtutor.evaluation.tasks import Task
 from fgtutor.evaluation.trials import (
@@ -312,7 +311,7 @@ def run(config: SwitchingConfig) -> int:
         config,
         title=f"From terrain to terrain ({config.robot})",
         tasks=make_tasks(config),
-        settings=settings_of(config, COMMAND, without=("trials",), zoo=config.zoo_digests()),
+        settings=config.run_settings(COMMAND, without=("trials",)),
         cost=cost,
         find=find,
     )

@@ -6,8 +6,8 @@ Source: paper, Sec. IV-B: a trial fails if no route is found or the goal is not 
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Any, TypedDict, TypeVar
@@ -15,7 +15,7 @@ from typing import Any, TypedDict, TypeVar
 from fgtutor.baselines import AssessedMap, Planner, find_route
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.evaluation.shards import RunConfig, digest
+from fgtutor.evaluation.shards import RunConfig, digest, settings_of
 from fgtutor.execution import Episode, FollowConfig, execute_batch
 from fgtutor.io.validation import Seed
 from fgtutor.routes import Refusal, Route
@@ -64,6 +64,13 @@ class ZooConfig(RunConfig):
 @dataclass(frozen=True, kw_only=True)
 class PlannedConfig(PlanOptions, ZooConfig):
     """Which specialists plan, and by what settings."""
+
+    def run_settings(
+        self, command: str, *, without: Collection[str] = (), **more: Any
+    ) -> dict[str, Any]:
+        """Return what a command's rows depend on (see `settings_of`), the planning and the zoo."""
+        everything = asdict(self.planning) | {"zoo": self.zoo_digests()} | more
+        return settings_of(self, command, without=("settings", *without), **everything)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
