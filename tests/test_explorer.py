@@ -61,12 +61,12 @@ def test_policies_that_may_not_drive_change_no_number_of_the_others(
     explorer = Explorer(grid, said, *corners(grid), policies=tuple(policies), **single)
     team = {name: said[name] for name in NAMES if name in policies}
     alone = Explorer(grid, team, *corners(grid), **single)
-    np.testing.assert_array_equal(explorer.fused, alone.fused)
+    np.testing.assert_array_equal(explorer.plan.fused, alone.plan.fused)
     assert explorer.status == alone.status
     for i, name in enumerate(NAMES):
         f = said[name].weighted(low, low + width)
-        np.testing.assert_array_equal(explorer.tensors[i], f if name in policies else 0 * f)
-        np.testing.assert_array_equal(explorer.weights[name], said[name].ood(low, low + width))
+        np.testing.assert_array_equal(explorer.plan.tensors[i], f if name in policies else 0 * f)
+        np.testing.assert_array_equal(explorer.plan.weights[name], said[name].ood(low, low + width))
 
 
 @pytest.mark.parametrize("settings", [PlanSettings(), PAPER])
@@ -79,7 +79,7 @@ def test_the_route_is_that_of_plan_on_map(make_rolling, settings):
     assert explorer.route is not None
     assert explorer.route.to_json() == plan.route.to_json()
     for name, weight in plan.weights.items():
-        np.testing.assert_array_equal(explorer.weights[name], weight)
+        np.testing.assert_array_equal(explorer.plan.weights[name], weight)
 
 
 def test_a_switch_in_the_middle_is_paid_once():
@@ -112,8 +112,8 @@ def test_every_update_is_as_if_new():
             grid, said, moved.start, moved.goal, moved.settings, policies=moved.policies
         )
         assert moved.status == fresh.status
-        np.testing.assert_array_equal(moved.fused, fresh.fused)
-        np.testing.assert_array_equal(moved.policy_map, fresh.policy_map)
+        np.testing.assert_array_equal(moved.plan.fused, fresh.plan.fused)
+        np.testing.assert_array_equal(moved.plan.policy_map, fresh.plan.policy_map)
 
 
 def test_no_route_is_said_not_raised():
@@ -142,12 +142,12 @@ def test_settings_without_meaning_are_refused_and_change_nothing(changes, error,
     grid, said = random_world(2)
     explorer = Explorer(grid, said, *corners(grid))
     before = explorer.settings, explorer.policies, explorer.goal, explorer.status
-    fused = explorer.fused.clone()
+    fused = explorer.plan.fused.clone()
     with pytest.raises(error, match=words):
         explorer.update(**changes)
     now = explorer.settings, explorer.policies, explorer.goal, explorer.status
     assert now == before
-    np.testing.assert_array_equal(explorer.fused, fused)
+    np.testing.assert_array_equal(explorer.plan.fused, fused)
 
 
 def test_an_explorer_needs_a_zoo_of_its_map():
@@ -167,8 +167,8 @@ def test_hovering_reads_a_cells_numbers():
     assert lines[1].split() == ["heading", *directions.NAMES]
     table = {line[:11].strip(): line[11:].split() for line in lines[1:]}
     assert table["L gaps"] == [f"{v:.2f}" for v in said["gaps"].reconstruction[3, 2].tolist()]
-    assert table["F_max"] == [f"{v:.2f}" for v in explorer.fused[3, 2].tolist()]
-    assert table["P"] == [NAMES[i] for i in explorer.policy_map[3, 2]]
+    assert table["F_max"] == [f"{v:.2f}" for v in explorer.plan.fused[3, 2].tolist()]
+    assert table["P"] == [NAMES[i] for i in explorer.plan.policy_map[3, 2]]
     with pytest.raises(ConfigError, match=r"no cell \(9, 0\) on a map of 9 x 7"):
         explorer.read((9, 0))
 
@@ -187,10 +187,10 @@ def test_a_scene_has_the_figures_colours():
         np.testing.assert_allclose(scene.pictures[key][~unknown], drawn[~unknown], atol=2.1)
 
     compare("M", maps.draw_elevation(grid))
-    compare("P", maps.draw_policy_map(explorer.policy_map, explorer.fused, grid, NAMES,
+    compare("P", maps.draw_policy_map(explorer.plan.policy_map, explorer.plan.fused, grid, NAMES,
                                          f_min=0.95))  # fmt: skip
     for name in NAMES:
-        compare(f"w {name}", maps.draw_weight(explorer.weights[name], grid, name))
+        compare(f"w {name}", maps.draw_weight(explorer.plan.weights[name], grid, name))
     for picture in scene.pictures.values():
         assert picture.shape == (7, 9, 3) and picture.dtype == np.uint8
         assert np.abs(picture[unknown] / 255 - to_rgb(maps.UNKNOWN)).max() < 0.01

@@ -72,7 +72,7 @@ def test_a_drag_redraws_and_the_text_follows(widgets, grid, said):
     board.taus.value = (1.0, 1.0)  # where the ends meet, w_ood is nearly a step
     loss = said["gaps"].reconstruction
     clear = (loss - 1).abs() > 0.01
-    assert torch.equal(board.explorer.weights["gaps"][clear], (loss < 1)[clear].float())
+    assert torch.equal(board.explorer.plan.weights["gaps"][clear], (loss < 1)[clear].float())
 
 
 @pytest.mark.parametrize(("name", "settings"), SETTINGS.items())

@@ -1,1 +1,1 @@
-"""Pictures, videos and the course's tools."""
+"""The course: what its notebooks draw and drive, its exercises and their marks, its widgets."""

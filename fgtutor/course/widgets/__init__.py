@@ -1,1 +1,1 @@
-"""The live widgets of the notebooks."""
+"""Widgets of the notebooks: drag the taus, paint a terrain, drive a robot."""

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from torch import Tensor
 
 from fgtutor import directions
 from fgtutor.course.widgets.panels import Cell, Point, cell_table, check_cell
@@ -19,7 +18,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.feasibility import TAU_HIGH, TAU_LOW
 from fgtutor.fusion import fuse
-from fgtutor.planning import plan
+from fgtutor.planning import Plan, plan
 from fgtutor.routes import Refusal, Route
 from fgtutor.settings import PlanSettings
 from fgtutor.specialist import Specialist
@@ -34,22 +33,15 @@ class Explorer:
         policies: The policies that may drive.
         start: Start (x, y), m.
         goal: Goal (x, y), m.
-        weights: w_ood of every policy, [nx, ny, 8], by name.
-        tensors: F_i of every policy, [nx, ny, 8], 0 for those that may not drive.
-        fused: F_max, [nx, ny, 8].
-        policy_map: P, [nx, ny, 8], an index into `names`.
-        answer: The cheapest route, or why there is none.
+        plan: The route, or why there is none, and every stage on the way; F_i is 0 for policies
+            that may not drive.
     """
 
     settings: PlanSettings
     policies: tuple[str, ...]
     start: Point
     goal: Point
-    weights: dict[str, Float[Tensor, "nx ny 8"]]
-    tensors: list[Float[Tensor, "nx ny 8"]]
-    fused: Float[Tensor, "nx ny 8"]
-    policy_map: Int[Tensor, "nx ny 8"]
-    answer: Route | Refusal
+    plan: Plan
 
     def __init__(
         self,
@@ -96,7 +88,7 @@ class Explorer:
     ) -> None:
         """Take over what is given, `changes` being fields of `PlanSettings`, and plan anew.
 
-        A route that does not exist is no error: `answer` says why. "calibrated" thresholds are
+        A route that does not exist is no error: `status` says why. "calibrated" thresholds are
         those of each assessment. After an error everything is as it was.
 
         Raises:
@@ -128,19 +120,18 @@ class Explorer:
             names=self.names,
         )
         self.settings, self.policies, self.start, self.goal = settings, policies, start, goal
-        self.weights, self.tensors, self.answer = weights, tensors, answer
-        self.fused, self.policy_map = fused, policy_map
+        self.plan = Plan(self.names, tensors, weights, fused, policy_map, answer)
 
     @property
     def route(self) -> Route | None:
-        """The cheapest route; None if there is none, and `answer` says why."""
-        return self.answer if isinstance(self.answer, Route) else None
+        """The cheapest route; None if there is none, and `status` says why."""
+        return self.plan.answer if isinstance(self.plan.answer, Route) else None
 
     @property
     def best(self) -> tuple[Float[np.ndarray, "nx ny"], Int[np.ndarray, "nx ny"]]:
         """F_max of each cell's best heading, and P there."""
-        feasibility, heading = self.fused.max(dim=-1)
-        policy = self.policy_map.gather(-1, heading[..., None])[..., 0]
+        feasibility, heading = self.plan.fused.max(dim=-1)
+        policy = self.plan.policy_map.gather(-1, heading[..., None])[..., 0]
         return feasibility.numpy(), policy.numpy()
 
     @property
@@ -150,9 +141,9 @@ class Explorer:
         shown = taus if isinstance(taus, str) else "{:.2f} to {:.2f}".format(*taus)
         if not self.policies:
             return f"tau {shown}: No policy may drive: tick at least one"
-        if isinstance(self.answer, Refusal):
-            return f"tau {shown}: No route: {self.answer.reason}"
-        route = self.answer
+        route = self.plan.answer
+        if isinstance(route, Refusal):
+            return f"tau {shown}: No route: {route.reason}"
         metres = directions.STEP_LENGTHS[route.headings] * self.elevation.resolution
         drives = ", ".join(
             f"{self.names[i]} {metres[route.policies == i].sum():.1f} m"
@@ -170,9 +161,9 @@ class Explorer:
         rows = {
             **{f"f {name}": one.f[cell].tolist() for name, one in said},
             **{f"L {name}": one.reconstruction[cell].tolist() for name, one in said},
-            **{f"w {name}": weight[cell].tolist() for name, weight in self.weights.items()},
-            "F_max": self.fused[cell].tolist(),
-            "P": [self.names[i] for i in self.policy_map[cell].tolist()],
+            **{f"w {name}": weight[cell].tolist() for name, weight in self.plan.weights.items()},
+            "F_max": self.plan.fused[cell].tolist(),
+            "P": [self.names[i] for i in self.plan.policy_map[cell].tolist()],
         }
         return cell_table(self.elevation, cell, rows)
 

@@ -8,7 +8,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
+from scipy.ndimage import find_objects
 
 from fgtutor import directions, patches
 from fgtutor.course.widgets.panels import (
@@ -24,7 +25,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.figures.style import policy_colours
 from fgtutor.specialist import Specialist
-from fgtutor.tensorization import Assessment, Taus, assess, resolve_taus
+from fgtutor.tensorization import Assessment, Taus, assess
 
 Window = tuple[slice, slice]
 
@@ -45,7 +46,7 @@ class Painting:
         Raises `ThresholdError` for taus that cannot be used.
         """
         self.specialist, self.f_min = specialist, f_min
-        self.taus = resolve_taus(taus, specialist)
+        self._taus: Taus = taus
         self._blank = elevation.filled().heights
         self._resolution, self._origin = elevation.resolution, elevation.origin
         self.heading: int | None = None
@@ -57,7 +58,7 @@ class Painting:
         self.elevation = self._map(self._blank)
         """The map as painted so far."""
         self._prepared = patches.prepare(self.elevation).heights
-        self.assessment: Assessment = assess(self.elevation, self.specialist)
+        self.assessment: Assessment = assess(self.elevation, self.specialist, taus=self._taus)
         """f and L_recon of the painted map."""
         self.window: Window | None = None
         """The cells that the last stroke assessed anew."""
@@ -94,7 +95,7 @@ class Painting:
         sees = patches.reach(self.specialist.grid) + self._resolution
         # What a prepared cell depends on: the closing's dilation, then its erosion, then smoothing.
         depends = 2 * patches.HOLE_REACH + patches.SPACING + self._resolution
-        window = self._grown((_span(changed, 0), _span(changed, 1)), sees)
+        window = self._grown(find_objects(changed.astype(int))[0], sees)
         # The map around the window is only read, so that its cells come out as on the whole map.
         read = self._grown(window, sees + depends)
         part = assess(self._map(self.elevation.heights[read], read), self.specialist)
@@ -125,7 +126,7 @@ class Painting:
     @property
     def shown(self) -> Float[np.ndarray, "nx ny"]:
         """F of the chosen heading, or of each cell's best."""
-        F = self.assessment.weighted(*self.taus).numpy()
+        F = self.assessment.weighted().numpy()
         return F.max(axis=-1) if self.heading is None else F[..., self.heading]
 
     @property
@@ -144,12 +145,12 @@ class Painting:
     def read(self, cell: Cell) -> str:
         """Return a cell's numbers; raises `ConfigError` off the map."""
         check_cell(self.elevation, cell)
-        assessment, taus = self.assessment, self.taus
+        assessment = self.assessment
         tensors = {
             "f": assessment.f,
             "L_recon": assessment.reconstruction,
-            "w_ood": assessment.ood(*taus),
-            "F": assessment.weighted(*taus),
+            "w_ood": assessment.ood(),
+            "F": assessment.weighted(),
         }
         rows = {label: tensor[cell].tolist() for label, tensor in tensors.items()}
         return cell_table(self.elevation, cell, rows)
@@ -183,9 +184,3 @@ class Painting:
             box=box,
             status=self.status,
         )
-
-
-def _span(used: Bool[np.ndarray, "nx ny"], axis: int) -> slice:
-    """Return the range along an axis that holds every used cell."""
-    places = np.nonzero(used)[axis]
-    return slice(int(places.min()), int(places.max()) + 1)

@@ -64,7 +64,9 @@ class TauPictures:
             "P": picture(chosen, known),
         }
         weights = []
-        for colour, (name, weight) in zip(self._palette, explorer.weights.items(), strict=True):
+        for colour, (name, weight) in zip(
+            self._palette, explorer.plan.weights.items(), strict=True
+        ):
             key = f"w {name}"
             mean = weight.mean(dim=-1, keepdim=True).numpy()
             pictures[key] = picture(1 - mean * (1 - colour), known)
@@ -121,13 +123,13 @@ def tau_figure(
         ):
             explorer.update(taus=(low, high))
             draw_weight(
-                torch.stack([*explorer.weights.values()]).amax(dim=0), elevation, axes=above
+                torch.stack([*explorer.plan.weights.values()]).amax(dim=0), elevation, axes=above
             )
             above.set_title(f"{name}: tau {low:g} to {high:g}", **TITLE, loc="left")
             above.set_xlabel("dark: some policy has seen such ground", fontsize=9)
             draw_policy_map(
-                explorer.policy_map,
-                explorer.fused,
+                explorer.plan.policy_map,
+                explorer.plan.fused,
                 elevation,
                 explorer.names,
                 f_min=explorer.settings.f_min,

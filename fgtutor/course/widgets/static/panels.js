@@ -1,6 +1,6 @@
 // Draws a scene (fgtutor/course/widgets/panels.py) on canvases, and tells Python what a person does with it.
 //
-// Pictures come as RGB bytes, one pixel a cell, upright: row 0 is the largest y. Points of the
+// Pictures come as RGB bytes, one pixel per cell, upright: row 0 is the largest y. Points of the
 // overlay count (right, down) in cells. Messages name cells as Python does: [ix, iy], y up.
 
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
@@ -12,7 +12,7 @@ function make(tag, className, parent) {
   return element;
 }
 
-// One pixel a cell, off screen; the visible canvas shows it enlarged.
+// One pixel per cell, off screen; the visible canvas shows it enlarged.
 function cellsAsImage(view, [nx, ny]) {
   const rgb = new Uint8Array(view.buffer, view.byteOffset, view.byteLength);
   const small = document.createElement("canvas");
