@@ -108,6 +108,7 @@ def test_a_gl_backend_that_does_not_exist_is_named_with_a_reason(monkeypatch):
     assert finding.state == "note" and "crayons" in finding.value and "MUJOCO_GL" in finding.fix
 
 
+@pytest.mark.slow
 def test_a_gl_backend_that_hangs_is_given_up(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     [finding] = [f for f in doctor.examine(DoctorConfig(gl_seconds=1e-3)) if f.what == "gl"]

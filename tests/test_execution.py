@@ -218,6 +218,7 @@ def two(make_rolling):
     return route, Terrain.from_elevation(elevation, *ends.values()), zoo
 
 
+@pytest.mark.slow
 def test_policies_are_taken_by_name_whatever_the_order_of_the_zoo(two, make_rolling):
     route, terrain, zoo = two
     stranger = make_rolling("other", command=(0.2, 0.0, 0.0))

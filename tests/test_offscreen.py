@@ -92,6 +92,7 @@ def test_a_film_left_early_leaves_nothing_for_the_next(renderer, watched):
     assert u > 0.1
 
 
+@pytest.mark.slow
 def test_closing_ends_the_process(renderer):
     with Renderer(ball(), *SIZE) as another:
         process = another._process

@@ -75,6 +75,7 @@ def test_single_options_change_one_thing():
     assert (one.switch_cost, one.cost, one.taus) == (2.0, "inverse", "paper")
 
 
+@pytest.mark.slow
 def test_stage_by_stage(asked, ground, zoo):
     name, expected = asked
     settings = SETTINGS[name]
@@ -91,6 +92,7 @@ def test_stage_by_stage(asked, ground, zoo):
     assert same(route.to_json(), expected)
 
 
+@pytest.mark.slow
 def test_as_the_tables_plan(asked, ground, zoo):
     name, expected = asked
     ends = ground.start, ground.goal
@@ -98,6 +100,7 @@ def test_as_the_tables_plan(asked, ground, zoo):
     assert same(find_route(ours, assessed, *ends, SETTINGS[name]).raise_for().to_json(), expected)
 
 
+@pytest.mark.slow
 def test_as_the_plan_command_plans(asked, tmp_path, capsys):
     name, expected = asked
     (x0, y0), (x1, y1) = demo.START, demo.GOAL
