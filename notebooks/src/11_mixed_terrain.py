@@ -67,8 +67,8 @@ for part in terrain.sections:
 # Four autoencoders look at one corridor.
 
 # %%
-from fgtutor.figures.style import Picture
 from fgtutor.figures.maps import draw_weight
+from fgtutor.figures.style import Picture
 
 sheet = Picture(7.2, 6.4)
 for axes, name in zip(sheet.subplots(len(zoo), 1, sharex=True), zoo, strict=True):
@@ -261,9 +261,9 @@ for kind, total in totals.items():
 
 # %% [markdown]
 # That is why the real table has thousands of trials behind it, and why this package never prints a
-# rate without its interval. `fgtutor evaluate matrix --robot a1 --trials 200 --out report` makes one that you can put your name to; `--protocol paper` is the paper's own; it can be
-# interrupted, and it says beforehand how long it will take. Notebook 13 shows how to share the
-# work.
+# rate without its interval. `fgtutor evaluate matrix --robot a1 --trials 200 --out report` makes
+# one that you can put your name to; `--protocol paper` is the paper's own. It can be interrupted,
+# and it says beforehand how long it will take. Notebook 13 shows how to share the work.
 
 # %% [markdown]
 # ## What to try
