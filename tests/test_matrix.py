@@ -6,7 +6,7 @@ import pytest
 
 from fgtutor.__main__ import main
 from fgtutor.baselines import ours
-from fgtutor.errors import ConfigError, ReportError, TerrainError
+from fgtutor.errors import ConfigError, ReportError, SpecialistError, TerrainError
 from fgtutor.evaluation import ablation, success
 from fgtutor.evaluation.ablation import AblationConfig
 from fgtutor.evaluation.cost import Cost
@@ -248,6 +248,8 @@ def test_cost_by_hand():
 def test_wrong_names_are_refused_before_anything_runs(config):
     with pytest.raises(TerrainError, match="moon"):
         run(replace(config, terrains=("flat", "moon")))
+    with pytest.raises(SpecialistError, match="no zoo for robot 'wheelbarrow'"):
+        run(MatrixConfig(robot="wheelbarrow"))
     with pytest.raises(ConfigError, match="policy named wings"):
         run(replace(config, policies=("wings",)))
     with pytest.raises(ConfigError, match="trials"):

@@ -50,11 +50,12 @@ def table(trials: Sequence[TrialRow]) -> str:
 
 def run(config: MatrixConfig) -> int:
     """Evaluate from the command line, print the table and write the report."""
+    columns = policies(config, config.load_zoo())  # an unknown robot fails here
     return success.run_and_report(
         config,
         COMMAND,
         title=f"Success of policies on terrains ({config.robot})",
         terrains=config.terrains or (*ROBOTS[config.robot].scale.mixed, "mixed"),
-        policies=policies(config, config.load_zoo()),
+        policies=columns,
         table=table,
     )
