@@ -35,14 +35,14 @@ def run(config: MapConfig) -> int:
     """Map a cloud from the command line."""
     check_writable(config.out)
     cloud = read_cloud(config.cloud)
-    print(f"{config.cloud}: {len(cloud.points)} points")
     scanned = map_points(cloud, config=config, area=config.area)
-    print(scanned)
     elevation = scanned.elevation
+    # Written before anything is printed: a reader of the output that stops must not cost the map.
+    (elevation.filled() if config.fill else elevation).save(config.out)
+    print(f"{config.cloud}: {len(cloud.points)} points\n{scanned}")
     unknown = 1 - elevation.known.mean()
     median = np.median(scanned.count[elevation.known])
     print(f"{unknown:.1%} of the cells are unknown; the others hold {median:g} points (median)")
-    (elevation.filled() if config.fill else elevation).save(config.out)
     print(f"map -> {config.out}")
     left_out = (
         *cloud.notes,

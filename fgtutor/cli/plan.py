@@ -62,8 +62,9 @@ def run(config: PlanConfig) -> int:
         planned = plan_on_map(
             elevation, zoo, config.start, config.goal, settings=settings, progress=True
         )
-    print(planned.route)
     if config.json:
         write_json(config.json, planned.route.to_json())
+    print(planned.route)
+    if config.json:
         print(f"route -> {config.json}")
     return 0

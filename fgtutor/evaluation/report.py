@@ -49,6 +49,8 @@ class Findings:
     """What the table's numbers are, and how they were got."""
     figures: Mapping[str, Draw] = field(default_factory=dict)
     """By the name of their file."""
+    rows: str = "trials"
+    """What the rows are called."""
 
 
 def run_and_report(
@@ -78,9 +80,10 @@ def run_and_report(
         with watched or nullcontext():
             run = collect(tasks, settings, config, progress=True)
         found = find(run.rows)
-        print(f"{found.table}\n\n{found.caption}")
         if config.out:
             write_report(config.out, run, found, title=title, settings=settings, began=began)
+        print(f"{found.table}\n\n{found.caption}")
+        if config.out:
             print(f"report -> {config.out}")
         return 0
 
@@ -99,7 +102,7 @@ def write_report(
     Raises `StorageError` if the system refuses.
     """
     rows = run.rows
-    caption = f"{found.caption} {len(rows):,} trials in all."
+    caption = f"{found.caption} {len(rows):,} {found.rows} in all."
     make_folder(folder / FIGURES)
     for name, draw in found.figures.items():
         with atomic_write(folder / FIGURES / name) as path:
