@@ -60,7 +60,8 @@ def test_the_command_prints_a_table_and_writes_the_report(config, capsys, tmp_pa
     printed = capsys.readouterr().out
     assert "2 of 2 tasks to do\n" in printed
     assert table(rows) in printed and "tau paper" in printed
-    assert table(rows) in (out / "table.md").read_text()
+    text = (out / "table.md").read_text()
+    assert table(rows) in text and "2 drives in all" in text
 
 
 def test_the_table_by_hand():

@@ -214,7 +214,7 @@ def run_task(config: AdaptationConfig, index: int) -> list[AdaptationRow]:
 
 
 def make_tasks(config: AdaptationConfig) -> list[Task]:
-    """Cut the evaluation into tasks, one a map."""
+    """Cut the evaluation into tasks, one per map."""
     return [
         Task(name=f"map-{index:05d}", function=run_task, arguments=(config, index))
         for index in range(min(config.maps, config.trials))
@@ -316,7 +316,7 @@ def run(config: AdaptationConfig) -> int:
 def figures(
     first: Terrain, zoo: Mapping[str, Specialist], config: AdaptationConfig
 ) -> dict[str, Draw]:
-    """Return a map with route a checkpoint, drawn and as numbers."""
+    """Return a map with its route for each checkpoint, drawn and as numbers."""
     plans = find_plans(first, zoo, config)
     picture = draw_plans(
         first.elevation,

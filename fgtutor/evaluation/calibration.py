@@ -142,7 +142,7 @@ def run_task(config: CalibrationConfig, name: str) -> list[CalibrationRow]:
 
 
 def table(rows: Sequence[CalibrationRow]) -> str:
-    """Return the rows as a Markdown table: a line per Feasibility-Net, w_ood by who drove."""
+    """Return the rows as a Markdown table: a line per Feasibility-Net, a column per drive."""
 
     def write(weight: float | None) -> str:
         return "-" if weight is None else f"{weight:.2f}"
@@ -168,7 +168,7 @@ def run(config: CalibrationConfig) -> int:
             f"At least {samples:,} labelled patches each; robot {config.robot}, tau "
             f"{config.thresholds}, seed {config.seed}."
         )
-        return Findings(table=table(rows), caption=caption)
+        return Findings(table=table(rows), caption=caption, rows="drives")
 
     return run_and_report(
         config,

@@ -3,7 +3,7 @@
 Reads a finished run, its table and its figures; writes beside the shards (see `shards`)
 
     table.md     title, table, and a caption that says how many trials it stands on
-    rows.json    every trial, one a line
+    rows.json    every trial, one per line
     run.json     settings with seeds, machines with versions, times, numbers of tasks and trials
     figures/     what the command draws
 

@@ -1,8 +1,8 @@
 """Success rates over drawn grounds: what matrix, ablation and newcomer have in common.
 
-Reads a `TrialsConfig`, terrains and the names of planners; gives a row a pair, and a report folder.
+Reads a `TrialsConfig`, terrains and the names of planners; gives a row per trial, and a report.
 Trial k of a terrain is the same ground, start and goal for all planners.
-Source: paper, Sec. IV-B: 40 tasks of 250 trials a terrain, failures by reason.
+Source: paper, Sec. IV-B: 40 tasks of 250 trials per terrain, failures by reason.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +26,7 @@ from fgtutor.world.terrain import Terrain, make_terrain
 GROUNDS = 25
 """Grounds of one task, where each is driven once."""
 PAPER_GROUNDS, PAPER_TRIALS = 40, 10_000
-"""Tasks of a terrain, and its trials a policy: 40 times 250 (paper, Sec. IV-B)."""
+"""Tasks of a terrain, and its trials per policy: 40 times 250 (paper, Sec. IV-B)."""
 CLEARANCE = 0.5
 """Distance of a drawn start or goal from the obstacle and from the map's border, m."""
 
