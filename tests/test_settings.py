@@ -15,6 +15,7 @@ from fgtutor.__main__ import COMMANDS
 from fgtutor.baselines import AssessedMap, find_route, ours
 from fgtutor.cli import demo
 from fgtutor.cli import plan as plan_command
+from fgtutor.course.widgets.explorer import Explorer
 from fgtutor.evaluation import trials
 from fgtutor.execution import FollowConfig
 from fgtutor.planning import PAPER, SETTINGS, PlanSettings, plan_on_map
@@ -130,9 +131,15 @@ def test_as_trials_plan_and_follow(asked, ground, zoo, monkeypatch):
     monkeypatch.setattr(trials, "execute_batch", noted)
     grounds = [trials.Ground(terrain=ground, seeds=(0,))]
     with pytest.raises(KeyboardInterrupt):
-        trials.drive(grounds, {"ours": ours}, zoo, settings=SETTINGS[name])
+        list(trials.drive(grounds, {"ours": ours}, zoo, settings=SETTINGS[name]))
     ((route, hold_steps),) = driven
     assert same(route, expected) and hold_steps == SETTINGS[name].hold_steps
+
+
+def test_as_the_sliders_plan(asked, ground, zoo):
+    name, expected = asked
+    explorer = Explorer(ground.elevation, zoo, ground.start, ground.goal, SETTINGS[name])
+    assert explorer.route is not None and same(explorer.route.to_json(), expected)
 
 
 def test_no_command_of_a_table_needs_an_option_to_plan_as_the_table_did():
