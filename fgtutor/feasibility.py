@@ -8,13 +8,13 @@ Source: paper, Sec. III-A (Eqs. 1-3) and Sec. III-B (Eq. 4).
 
 import math
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Annotated, overload
 
 import numpy as np
 import torch
 from annotated_types import Interval
 from jaxtyping import Bool, Float
-from rsl_rl.modules import MLP
 from torch import Tensor, nn
 
 from fgtutor.errors import ThresholdError
@@ -97,10 +97,10 @@ class FeasibilityNet(nn.Module):
         self.num_points, self.command_dim = num_points, command_dim
         self.hidden, self.vae_hidden = tuple(hidden), tuple(vae_hidden)
         self.latent, self.height_scale = latent, height_scale
-        self.head = MLP(num_points + command_dim, 1, hidden, "elu")
+        self.head = _mlp(nn.ELU, num_points + command_dim, *hidden, 1)
         # tanh saturates: unlike ELU it cannot extrapolate to terrain steeper than any it has seen.
-        self.encoder = MLP(num_points, 2 * latent, vae_hidden, "tanh")
-        self.decoder = MLP(latent, num_points, vae_hidden[::-1], "tanh")
+        self.encoder = _mlp(nn.Tanh, num_points, *vae_hidden, 2 * latent)
+        self.decoder = _mlp(nn.Tanh, latent, *vae_hidden[::-1], num_points)
 
     def feasibility(
         self, patch: Float[Tensor, "*batch points"], command: Float[Tensor, "*batch command"]
@@ -193,3 +193,11 @@ def calibrated_taus(quantiles: Mapping[str, float]) -> tuple[float, float]:
             f'{dict(quantiles)}: train the specialist again, or use taus="paper"'
         )
     return low, 2 * high
+
+
+def _mlp(activation: type[nn.Module], *widths: int) -> nn.Sequential:
+    """Build linear layers between the given widths, with an activation after all but the last."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        layers += [nn.Linear(inputs, outputs), activation()]
+    return nn.Sequential(*layers[:-1])
