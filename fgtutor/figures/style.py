@@ -25,9 +25,10 @@ POLICY_COLOURS = {
     "bridge": "#E69F00",
     "valley": "#56B4E9",
     "general": "#4D4D4D",
+    "ours": "#332288",
 }
 """A policy has one colour in the whole course: Okabe and Ito's, safe for the colour-blind."""
-OTHER_COLOURS = ("#882255", "#999933", "#332288", "#F0E442")
+OTHER_COLOURS = ("#882255", "#999933", "#44AA99", "#F0E442")
 """Policies that the course does not know take these in turn: Paul Tol's muted ones and a yellow."""
 LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours of curves that belong to no policy, in turn."""
