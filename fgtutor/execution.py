@@ -1,4 +1,4 @@
-"""Driving a planned route in simulation: follow it, and switch to the policy that each edge names.
+"""Driving a planned route in simulation, each step of it by the policy that the route names.
 
 Reads routes, terrains and specialists; gives an `Episode` each. Trials run side by side: one
 environment holds each terrain as one tile of its world, and trials of one terrain share that tile.

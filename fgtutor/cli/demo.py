@@ -1,4 +1,4 @@
-"""The whole idea in two minutes: plan over a mixed terrain with the specialists, and drive it.
+"""`fgtutor demo`: plan a route over a mixed terrain with the shipped specialists, and drive it.
 
 Reads the shipped zoo and a terrain; writes plan.png, route.json, a film of the drive and a film
 strip into a folder, and says what each shows. Source: paper, Sec. III, start to end.

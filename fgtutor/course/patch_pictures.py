@@ -66,7 +66,7 @@ def patch_gallery(
 ) -> Picture:
     """Draw patches side by side, all in one scale of colours; the robot looks to the right.
 
-    Whatever has one number a point may be shown so, such as the weights of a network's first layer.
+    Anything with one number per point may be shown so, such as the weights of a first layer.
     """
     check_arguments(patch_gallery, locals(), ConfigError)
     rows = -(-len(shown) // columns)
@@ -159,7 +159,7 @@ def _span(grid: PatchGrid) -> tuple[tuple[float, float], tuple[float, float]]:
 
 
 def _patch(axes: Axes, values: ArrayLike, grid: PatchGrid, reach: float) -> AxesImage:
-    """Show one number a point, with the robot's footprint and where it looks."""
+    """Show one number per point, with the robot's footprint and where it looks."""
     (x0, x1), (y0, y1) = _span(grid)
     # Points are [x, y]; an image is [row = y, column = x]: transpose, first row at the bottom.
     image = axes.imshow(

@@ -296,7 +296,7 @@ def run(config: AdaptationConfig) -> int:
     def find(trials: list[AdaptationRow]) -> Findings:
         return Findings(
             table=table(trials, zoo),
-            caption=f"{config.trials:,} trials a checkpoint on {len(tasks)} maps, with 95 % "
+            caption=f"{config.trials:,} trials per checkpoint on {len(tasks)} maps, with 95 % "
             f"intervals; robot {config.robot}, {config.planning}, seed {config.seed}. SPL against "
             f"the straight line of {STRAIGHT:g} m, as the paper's numbers imply, and against the "
             f"shortest way over no wall, {geodesic(first):.1f} m.",

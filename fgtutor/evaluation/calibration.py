@@ -1,4 +1,4 @@
-"""Does a Feasibility-Net know what its policy can do, and where it has never been?
+"""How well Feasibility-Nets predict r_v on new terrain, and how w_ood tells own ground from other.
 
 Reads a robot's zoo; drives every specialist over terrain it was never trained on, with
 deterministic actions, and compares: predicted feasibility with the r_v that followed (calibration),

@@ -166,7 +166,7 @@ def run_and_report(
         for (terrain, policy), cell in by_cell(trials).items():
             shares.setdefault(terrain, {})[policy] = Share.reached(cell)
         caption = (
-            f"Success in % with 95 % intervals, {config.count:,} trials a cell; robot "
+            f"Success in % with 95 % intervals, {config.count:,} trials per cell; robot "
             f"{config.robot}, protocol {config.protocol}, {config.planning}, seed {config.seed}."
         )
         chart = draw_shares(shares, title=title)

@@ -1,4 +1,4 @@
-"""Table III: from one terrain, and one policy, to the next, on a scanned map and lost by inches.
+"""Table III: from one terrain to the next, on a scanned map, by a robot unsure of its position.
 
 Reads a robot, a number of trials and levels of localisation noise; lays courses of two terrains
 (and one of all), scans each with a simulated MID-360, plans on that map, never on the truth, and
@@ -300,8 +300,8 @@ def run(config: SwitchingConfig) -> int:
         return Findings(
             table=table(trials),
             caption=(
-                f"Success in % with 95 % intervals, {config.trials:,} trials a cell; fixes with a "
-                "standard deviation of noise (cm) and a drift (cm per root second), maps from a "
+                f"Success in % with 95 % intervals, {config.trials:,} trials per cell; fixes with "
+                "a standard deviation of noise (cm) and a drift (cm per root second), maps from a "
                 f"simulated scan; robot {config.robot}, {config.planning}, seed {config.seed}."
             ),
             figures=charts(trials),

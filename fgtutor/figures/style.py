@@ -74,8 +74,8 @@ def save_figure(figure: Figure, path: str | Path, dpi: Dpi = 120) -> Path:
 
 def policy_colours(names: Sequence[str]) -> dict[str, str]:
     """Return the colour of each policy; names that the course does not know take a cycle."""
-    strangers = [name for name in names if name not in POLICY_COLOURS]
-    others = {name: OTHER_COLOURS[i % len(OTHER_COLOURS)] for i, name in enumerate(strangers)}
+    unknown = [name for name in names if name not in POLICY_COLOURS]
+    others = {name: OTHER_COLOURS[i % len(OTHER_COLOURS)] for i, name in enumerate(unknown)}
     return {name: POLICY_COLOURS.get(name) or others[name] for name in names}
 
 
