@@ -122,7 +122,7 @@ def test_the_command_writes_rows_and_a_report_and_prints_a_table(config, capsys)
     assert run(config) == 0
     printed = capsys.readouterr().out
     line = "| flat | 0 (0-56) | 100 (44-100) | 100 (44-100) | 100 (44-100) |"
-    assert line in printed and "3 trials a cell" in printed
+    assert line in printed and "3 trials per cell" in printed
     # Three maps for each of three policies of the zoo, three episodes for each of four columns.
     assert "1 of 1 tasks to do" in printed and "9 maps" in printed and "12 episodes" in printed
     assert "on 1 core like this one" in printed

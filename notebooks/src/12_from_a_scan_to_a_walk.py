@@ -123,20 +123,22 @@ picture
 # feet. Compare what a single cell rests on, on level ground and at its worst:
 
 # %%
-deviation = np.sqrt(np.nan_to_num(scanned.variance))
-level, edge = M.cell_of(*terrain.start), np.unravel_index(deviation.argmax(), M.shape)
+level = M.cell_of(*terrain.start)
+edge = np.unravel_index(np.nanargmax(np.abs(error.heights)), M.shape)
 for where, cell in (("on the level", level), ("at an edge", edge)):
-    print(f"{where:13} {scanned.count[cell]:4} points from {scanned.lowest[cell]:+.2f} m", end=" ")
-    print(f"to {scanned.p95[cell]:+.2f} m (95 %), scattered by {100 * deviation[cell]:.1f} cm")
+    inside = np.abs(points[:, :2] - M.centre_of(*cell)).max(axis=1) <= M.resolution / 2
+    z = points[inside, 2]
+    print(f"{where:13} {len(z):4} points, z = {z.min():+.2f} to {z.max():+.2f} m", end=", ")
+    print(f"standard deviation {100 * z.std():.1f} cm; the map says {M.heights[cell]:+.2f} m")
 
 # %% [markdown]
 # And birds, dust, reflections? Throw in a hundred points that are not there. A voxel far from its
 # nearest neighbours is an outlier:
 
 # %%
-dice = np.random.default_rng(0)
+rng = np.random.default_rng(0)
 low, high = np.array((*truth.extent[:2], 0.2)), np.array((*truth.extent[2:], 1.2))
-dirty = np.concatenate((glance, dice.uniform(low, high, (100, 3))))
+dirty = np.concatenate((glance, rng.uniform(low, high, (100, 3))))
 for neighbours in (0, to_cells.neighbours):
     careful = ScanConfig(resolution=truth.resolution, neighbours=neighbours, min_points=1)
     made = map_points(dirty, config=careful, area=truth.extent)
@@ -197,7 +199,7 @@ show_walk(walk, terrain, priced)
 
 # %%
 fix, drift, dt, seconds = 0.03, 0.01, 0.02, 20.0
-draws = dice.standard_normal((400, 2, round(seconds / dt)))
+draws = rng.standard_normal((400, 2, round(seconds / dt)))
 errors = fix * draws[:, 0] + np.cumsum(drift * np.sqrt(dt) * draws[:, 1], axis=-1)
 t = dt * np.arange(errors.shape[-1])
 
