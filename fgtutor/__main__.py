@@ -51,6 +51,7 @@ COMMANDS = {
         "NewcomerConfig",
         "say what one more specialist adds, and that it changes no other",
     ),
+    "walk": ("cli.walk", "WalkConfig", "plan a route over a map file and drive it"),
     "map": ("cli.map", "MapConfig", "turn a point cloud into an elevation map"),
     "export": ("cli.export", "ExportConfig", "write a policy as ONNX, with what it observes"),
     "notebooks": ("course.notebooks", "NotebooksConfig", "execute the course's notebooks"),

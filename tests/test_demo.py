@@ -46,7 +46,7 @@ def a1_zoo(make_specialist, tmp_path):
 def test_the_demo_reaches_the_goal_and_says_so(tmp_path, capsys):
     out = tmp_path / "new" / "demo"
     assert demo.run(demo.DemoConfig(robot="toy", out=out, video="gif")) == 0
-    names = {"plan.png", "route.json", "drive.gif", "drive.png"}
+    names = {"plan.png", "route.json", "episode.json", "drive.gif", "drive.png"}
     assert {path.name for path in out.iterdir()} == names
     said = capsys.readouterr().out
     assert all(str(out / name) in said for name in names) and "reached" in said
@@ -66,7 +66,7 @@ def test_the_a1_demo_shows_even_a_fall(a1_zoo, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(demo, "a1_terrain", lambda: make_terrain("steps", robot="a1", seed=3))
     out = tmp_path / "demo"
     assert demo.run(demo.DemoConfig(robot="a1", out=out, zoo=a1_zoo, taus="calibrated")) == 1
-    names = {"plan.png", "route.json", "drive.mp4", "drive.png"}
+    names = {"plan.png", "route.json", "episode.json", "drive.mp4", "drive.png"}
     assert {path.name for path in out.iterdir()} == names
     said = capsys.readouterr().out
     assert all(str(out / name) in said for name in names) and "fell" in said
@@ -80,7 +80,7 @@ def test_without_graphics_the_a1_demo_still_plans(a1_zoo, tmp_path, capsys, monk
     monkeypatch.setenv("MUJOCO_GL", "off")
     out = tmp_path / "demo"
     assert demo.run(demo.DemoConfig(robot="a1", out=out, zoo=a1_zoo, taus="calibrated")) == 1
-    assert {path.name for path in out.iterdir()} == {"plan.png", "route.json"}
+    assert {path.name for path in out.iterdir()} == {"plan.png", "route.json", "episode.json"}
     said = capsys.readouterr().out
     assert "no film of it" in said and "apt install" in said and "fell" in said
 

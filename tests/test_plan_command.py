@@ -4,6 +4,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from fgtutor import patches, planning
 from fgtutor.cli.plan import PlanConfig, choose, run
@@ -47,6 +48,19 @@ def test_the_command_plans_and_writes_the_route(case, tmp_path, capsys):
     assert route.cost == pytest.approx(0.1 * (18 + 2 * math.sqrt(2)) / 0.9, rel=1e-5)
     assert [15, 10] not in route.cells.tolist()
     assert "20 steps" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_plan_is_drawn_and_so_is_a_refusal(case, tmp_path, capsys):
+    assert run(PlanConfig(figure=tmp_path / "plan.png", **case)) == 0
+    assert "figure -> " in capsys.readouterr().out
+    with pytest.raises(InfeasibleCellError):
+        run(PlanConfig(figure=tmp_path / "refused.png", f_min=0.95, **case))
+    for name in ("plan.png", "refused.png"):
+        with Image.open(tmp_path / name) as picture:
+            assert picture.width > 800
+    with pytest.raises(StorageError, match="nowhere"):
+        run(PlanConfig(figure=tmp_path / "nowhere" / "plan.png", **case))
 
 
 def test_every_stage_is_kept(case, make_rolling):

@@ -1,26 +1,15 @@
 """`fgtutor demo`: plan a route over a mixed terrain with the shipped specialists, and drive it.
 
-Reads the shipped zoo and a terrain; writes plan.png, route.json, a film of the drive and a film
-strip into a folder, and says what each shows. Source: paper, Sec. III, start to end.
+Reads the shipped zoo and a terrain; does with it what `fgtutor walk` does with a map file.
 """
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import torch
-
+from fgtutor.cli.walk import Video, plan_and_drive
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import RenderingError
-from fgtutor.execution import FollowConfig, execute
-from fgtutor.figures.maps import plan_figure
-from fgtutor.figures.style import save_figure
-from fgtutor.figures.videos import film_strip, save_video
-from fgtutor.io.progress import waiting
-from fgtutor.io.storage import atomic_write, make_folder, write_json
 from fgtutor.io.validation import Seed, check_fields
-from fgtutor.planning import plan_on_map
 from fgtutor.settings import PlanOptions
 from fgtutor.specialist import load_zoo
 from fgtutor.world.terrain import Terrain, make_terrain
@@ -47,7 +36,7 @@ class DemoConfig(PlanOptions):
     """Seed of the robot's start position and yaw."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped ones."""
-    video: Literal["mp4", "gif"] = "mp4"
+    video: Video = "mp4"
     """Format of the film."""
 
     def __post_init__(self) -> None:
@@ -56,40 +45,14 @@ class DemoConfig(PlanOptions):
 
 def run(config: DemoConfig) -> int:
     """Run the demo; return 0 if the robot reached its goal, else 1 (the pictures show why)."""
-    began = time.monotonic()
-    torch.set_num_threads(1)  # small networks: on a busy machine more threads mostly wait
-    make_folder(config.out)
-
-    def announce(file: str, what: str) -> None:
-        print(f"{time.monotonic() - began:5.1f} s  {config.out / file}: {what}", flush=True)
-
-    zoo = load_zoo(config.robot, config.zoo)
-    terrain = a1_terrain() if config.robot == "a1" else toy_terrain()
-    elevation = terrain.elevation
-    print(f"{elevation}\nspecialists: {', '.join(zoo)}", flush=True)
-
-    with torch.inference_mode():
-        plan = plan_on_map(
-            elevation, zoo, terrain.start, terrain.goal, settings=config.planning, progress=True
-        )
-    write_json(config.out / "route.json", plan.route.to_json())
-    announce("route.json", str(plan.route))
-    save_figure(plan_figure(elevation, plan), config.out / "plan.png")
-    announce("plan.png", "the map and route, w_ood, F_max and the policy map")
-
-    with waiting("driving the route"):
-        follow = FollowConfig(hold_steps=config.planning.hold_steps)
-        episode = execute(plan.route, terrain, zoo, seed=config.seed, config=follow)
-    try:
-        with waiting("drawing the film"):
-            film = save_video(episode, terrain, plan.route, config.out / f"drive.{config.video}")
-        announce(film.name, str(episode))
-        with atomic_write(config.out / "drive.png") as path:
-            film_strip(episode, terrain, plan.route).save(path)
-        announce("drive.png", "the same as a film strip")
-    except RenderingError as error:
-        print(f"{episode}\nno film of it: {error}")
-    return int(not episode.success)
+    return plan_and_drive(
+        a1_terrain() if config.robot == "a1" else toy_terrain(),
+        load_zoo(config.robot, config.zoo),
+        config.planning,
+        out=config.out,
+        seed=config.seed,
+        video=config.video,
+    )
 
 
 def toy_terrain() -> Terrain:

@@ -11,6 +11,8 @@ import torch
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
+from fgtutor.figures.maps import plan_figure
+from fgtutor.figures.style import save_figure
 from fgtutor.io.storage import check_writable, write_json
 from fgtutor.io.validation import Unique, check_fields
 from fgtutor.planning import Point, plan_on_map
@@ -38,6 +40,8 @@ class PlanConfig(PlanOptions):
     """Which library searches."""
     json: Path | None = None
     """Write the route here."""
+    figure: Path | None = None
+    """Draw the plan here: the map with the route, w_ood, F_max and the policy map."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -53,8 +57,9 @@ def choose(zoo: dict[str, Specialist], names: tuple[str, ...]) -> dict[str, Spec
 
 def run(config: PlanConfig) -> int:
     """Plan from the command line, print the route's summary and write its JSON."""
-    if config.json:
-        check_writable(config.json)
+    for path in (config.json, config.figure):
+        if path:
+            check_writable(path)
     elevation = ElevationMap.load(config.map)
     zoo = choose(load_zoo(config.robot, config.zoo), config.policies)
     with torch.inference_mode():
@@ -62,9 +67,12 @@ def run(config: PlanConfig) -> int:
         planned = plan_on_map(
             elevation, zoo, config.start, config.goal, settings=settings, progress=True
         )
+    if config.figure and planned.tensors:  # of a refusal too: it shows where the ground is closed
+        save_figure(plan_figure(elevation, planned, f_min=settings.f_min), config.figure)
     if config.json:
         write_json(config.json, planned.route.to_json())
     print(planned.route)
-    if config.json:
-        print(f"route -> {config.json}")
+    for what, path in (("route", config.json), ("figure", config.figure)):
+        if path:
+            print(f"{what} -> {path}")
     return 0

@@ -29,10 +29,10 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.figures.style import TITLE, Picture, policy_colours
 from fgtutor.io.validation import Count, check_arguments
+from fgtutor.routes import Route
 
 if TYPE_CHECKING:
     from fgtutor.planning import Plan
-    from fgtutor.routes import Route
     from fgtutor.world.terrain import Section
 
 HEADING_COLOURS = (
@@ -238,7 +238,10 @@ def plan_figure(elevation: ElevationMap, plan: Plan, *, f_min: float = 0.1) -> P
 
     first = panels[0, 0].subplots()
     draw_elevation(elevation, axes=first)
-    draw_route(plan.route, elevation, axes=first)
+    if isinstance(plan.answer, Route):
+        draw_route(plan.answer, elevation, axes=first)
+    else:
+        first.set_title("No route", **TITLE, loc="left")
     columns = int(np.ceil(np.sqrt(len(plan.names))))
     rows = -(-len(plan.names) // columns)
     panels[0, 1].suptitle("2  Have I seen this before? w_ood of each policy", **TITLE, x=0.02)

@@ -188,6 +188,7 @@ contestants = [*zoo, "ours", *(["general"] if "general" in everyone else [])]
 ways = planners(everyone)
 
 
+# %%
 def compete(ground, assessed, seeds):
     """Plan with each planner, walk all the routes side by side, and count what came of it."""
     ends = ground.start, ground.goal

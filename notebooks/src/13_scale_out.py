@@ -40,6 +40,7 @@ terrain = make_terrain("valley", robot="a1", seed=1)
 M, ends = terrain.elevation, (terrain.start, terrain.goal)
 
 
+# %%
 def ask(zoo):
     assessed = AssessedMap(M, zoo)
     return assessed, find_route(ours, assessed, *ends)
