@@ -34,6 +34,20 @@ _RANKS = np.argsort(_ORDER)
 CURE = "plan on a part of the map (ElevationMap.crop), on coarser cells, or with switch_cost=0"
 
 
+def check_memory(shape: tuple[int, int], policies: int, switch_cost: float) -> None:
+    """Raise `TooLargeError` if an open map of this shape is too large to plan on.
+
+    Without free memory Linux would end the process, after it has tensorized for minutes.
+    """
+    cells = shape[0] * shape[1]
+    layers = policies if switch_cost else 1
+    arrays = (4 + 2 * policies) * cells * directions.NUM_HEADINGS * 8
+    edges = cells * layers * (directions.NUM_HEADINGS + layers - 1)
+    search = edges * EDGE + cells * layers * STATE
+    work = f"planning over {shape[0]} x {shape[1]} cells for {policies}"
+    require_memory(arrays + search, work, CURE)
+
+
 def as_networkx(
     fused: Float[np.ndarray, "nx ny 8"],
     policy_map: Int[np.ndarray, "nx ny 8"],
@@ -250,6 +264,17 @@ class Search:
         ends = _minus(start, low), _minus(goal, low)
         states, _ = narrowed._backwards(narrowed._reversed(), *ends, bound)
         return None if states is None else states + np.array([0, *low])
+
+    def reached(self, start: Cell) -> Bool[np.ndarray, "nx ny"]:
+        """Return the cells that some chain of steps leads to."""
+        graph, shape = self._reversed().T.tocsr(), self.layers.shape[:3]
+        reached = np.zeros(shape, dtype=bool)
+        for layer in range(shape[0]):
+            first = int(np.ravel_multi_index((layer, *start), shape))
+            reached.flat[csgraph.breadth_first_order(graph, first, return_predecessors=False)] = (
+                True
+            )
+        return np.logical_or.reduce(reached)
 
     def _reversed(self) -> csr_array:
         return reversed_graph(self.layers, self.switch_cost, self.cost, self.resolution)

@@ -35,19 +35,16 @@ from fgtutor.errors import (
 )
 from fgtutor.fusion import fuse
 from fgtutor.graphs import (
-    CURE,
-    EDGE,
-    STATE,
     Cell,
     Search,
     as_networkx,
     as_switching_networkx,
+    check_memory,
     headings_of,
     step_cost,
     steps_of,
 )
 from fgtutor.grid import coordinate_text, point_text
-from fgtutor.io.machine import require_memory
 from fgtutor.io.progress import QUICK, duration
 from fgtutor.io.validation import numbers
 from fgtutor.routes import Refusal, Route
@@ -99,6 +96,24 @@ class Plan:
         """The cheapest route; raises the `PlanningError` of the refusal if there is none."""
         return self.answer.raise_for()
 
+    def why_not(self, elevation: ElevationMap) -> list[str]:
+        """Say for each policy what it finds of the step on from the nearest place to the goal.
+
+        Empty where there is a route, or where the refusal is about the start or the goal itself.
+        """
+        if isinstance(self.answer, Route) or self.answer.nearest is None:
+            return []
+        at = (*elevation.cell_of(*self.answer.nearest), self.answer.heading or 0)
+        if not elevation.known_steps[at]:
+            return ["The step on from there leads onto ground that was never observed."]
+        place = point_text(self.answer.nearest, elevation.resolution)
+        reasons = [f"On from {place} m towards {directions.NAMES[at[-1]]}:"]
+        for name, tensor in zip(self.names, self.tensors, strict=True):
+            F, w_ood = float(tensor[at]), float(self.weights[name][at])
+            known = "it knows such ground" if w_ood >= 0.5 else "it has hardly seen such ground"
+            reasons.append(f"{name}: F = {F:.2f}, w_ood = {w_ood:.2f} ({known})")
+        return reasons
+
 
 def plan_on_map(
     elevation: ElevationMap,
@@ -122,7 +137,7 @@ def plan_on_map(
     if not zoo:
         raise ConfigError("planning needs at least one specialist, the zoo is empty")
     settings = replace(settings or PlanSettings(), **changes)
-    _check_memory(elevation, len(zoo), settings.switch_cost)
+    check_memory(elevation.shape, len(zoo), settings.switch_cost)
     try:
         for point, role in ((start, "start"), (goal, "goal")):
             usable_cell(elevation, point, role, settings.unknown)
@@ -221,7 +236,8 @@ class _Problem:
             raise ConfigError("switch_cost > 0 needs the F_i of all policies: tensors=[F_1, ...]")
         lists = {"tensors": tensors, "ood": ood, "names": names}
         given = {what: len(one) for what, one in lists.items() if one is not None}
-        _check_memory(grid, given.get("tensors", 0) + given.get("ood", 0), settings.switch_cost)
+        kept = given.get("tensors", 0) + given.get("ood", 0)
+        check_memory(grid.shape, kept, settings.switch_cost)
         self.fused = self._fit("fused", [fused])[0]
         policies = self._fit("policy_map", [policy_map])[0]
         self.policy_map = policies.astype(np.int64, copy=False)
@@ -266,8 +282,8 @@ class _Problem:
                 )
         return np.stack(each)
 
-    def cheapest(self, start: Point, goal: Point) -> Route:
-        """Return the cheapest route, or raise the `PlanningError` that says why there is none."""
+    def cheapest(self, start: Point, goal: Point) -> Route | Refusal:
+        """Return the cheapest route; an end that cannot be used is raised as `PlanningError`."""
         unknown = self.settings.unknown
         ends = tuple(
             usable_cell(self.grid, point, role, unknown)
@@ -282,13 +298,25 @@ class _Problem:
         networked = self.settings.backend == "networkx"
         states = search.networkx(*ends) if networked else search.scipy(*ends)
         if states is None:
-            raise UnreachableError(
+            nearest, heading = self._nearest(search.reached(ends[0]), ends[1])
+            error = UnreachableError(
                 f"start {self._text(start)} m, cell {ends[0]}, and goal {self._text(goal)} m, cell "
                 f"{ends[1]}, can both be used, but no chain of steps with F >= "
-                f"{self.settings.f_min:g} joins them: lower f_min, move one of them or add a "
+                f"{self.settings.f_min:g} joins them: the place nearest to the goal that can be "
+                f"reached is {self._text(nearest)} m; lower f_min, move one of them or add a "
                 "specialist (tensorization.why_blocked names what closes a cell)"
             )
+            return Refusal(error, nearest, heading)
         return self._route(states)
+
+    def _nearest(self, reached: np.ndarray, goal: Cell) -> tuple[Point, int]:
+        """Return the reached cell nearest to the goal, m, and the heading on from it."""
+        cells = np.argwhere(reached)
+        cell = cells[((cells - goal) ** 2).sum(axis=1).argmin()]
+        heading = int(
+            (directions.STEPS / directions.STEP_LENGTHS[:, None] @ (goal - cell)).argmax()
+        )
+        return self.grid.centre_of(*cell.tolist()), heading
 
     def _route(self, states: np.ndarray) -> Route:
         """Describe a chain of states (layer, ix, iy); of a cell's states the first came there."""
@@ -365,20 +393,3 @@ def usable_cell(grid: ElevationMap, point: Point, role: str, unknown: Unknown) -
             'place, or trust filled heights with unknown="fill"'
         )
     return cell
-
-
-def _check_memory(grid: ElevationMap, policies: int, switch_cost: float) -> None:
-    """Raise `TooLargeError` if an open map of this size is too large to plan on.
-
-    Without free memory Linux would end the process, after it has tensorized for minutes.
-    """
-    cells = grid.heights.size
-    layers = policies if switch_cost else 1
-    arrays = (4 + 2 * policies) * cells * directions.NUM_HEADINGS * 8
-    edges = cells * layers * (directions.NUM_HEADINGS + layers - 1)
-    search = edges * EDGE + cells * layers * STATE
-    require_memory(arrays + search, f"planning over {_size(grid)} for {policies}", CURE)
-
-
-def _size(grid: ElevationMap) -> str:
-    return f"{grid.shape[0]} x {grid.shape[1]} cells"

@@ -28,6 +28,10 @@ class Refusal:
 
     error: PlanningError
     """The reason, by its type: `UnknownCellError`, `InfeasibleCellError`, `UnreachableError`."""
+    nearest: tuple[float, float] | None = None
+    """The place nearest to the goal that can be reached, m, if start and goal can be used."""
+    heading: int | None = None
+    """The heading from there that leads towards the goal."""
 
     @property
     def reason(self) -> str:

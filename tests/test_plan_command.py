@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from fgtutor.errors import (
     StorageError,
     ThresholdError,
     UnknownCellError,
+    UnreachableError,
 )
 from fgtutor.io import progress
 from fgtutor.planning import PAPER, Refusal, Route, plan_on_map
@@ -120,6 +122,28 @@ def test_what_cannot_work_is_refused_before_the_map_is_tensorized(
     arguments = {"start": case["start"], "goal": case["goal"]} | change
     with pytest.raises(error):
         plan_on_map(ElevationMap.load(case["map"]), {"a": make_rolling("a")}, **arguments)
+
+
+def test_a_refusal_says_for_each_policy_what_it_finds_there(case, make_rolling, capsys):
+    heights = np.zeros((30, 20))
+    heights[14:17] = np.nan
+    ElevationMap(heights).save(case["map"])
+    with pytest.raises(UnreachableError, match=r"nearest to the goal .* \(1.35, 1.05\) m"):
+        run(PlanConfig(**case))
+    assert "leads onto ground that was never observed" in capsys.readouterr().out
+
+    zoo = {"a": make_rolling("a"), "b": make_rolling("b")}
+    elevation = ElevationMap(np.zeros((9, 9)))
+    known = {name: torch.ones(9, 9, 8) for name in zoo}
+    known["a"][4], known["b"][4] = 0.05, 0.0
+    plan = plan_on_map(elevation, zoo, (0.15, 0.45), (0.85, 0.45), tensors=known)
+    weights = {"a": torch.full((9, 9, 8), 0.9), "b": torch.zeros(9, 9, 8)}
+    assert replace(plan, weights=weights).why_not(elevation) == [
+        "On from (0.45, 0.45) m towards +x:",
+        "a: F = 0.05, w_ood = 0.90 (it knows such ground)",
+        "b: F = 0.00, w_ood = 0.00 (it has hardly seen such ground)",
+    ]
+    assert plan_on_map(elevation, zoo, (0.15, 0.45), (0.25, 0.45)).why_not(elevation) == []
 
 
 def test_an_end_never_observed_is_refused_before_the_map_is_tensorized(

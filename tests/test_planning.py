@@ -310,6 +310,20 @@ def test_a_refusal_is_a_value_with_its_reason(backend, cell, error):
     assert again.reason == answer.reason and type(again.error) is error
 
 
+@pytest.mark.parametrize("switch_cost", [0.0, 1.0])
+def test_a_refusal_names_the_place_nearest_to_the_goal(switch_cost):
+    tensor, grid = np.ones((2, 9, 5, 8)), flat(9, 5)
+    tensor[:, 3] = 0.05  # column 3 can be entered, and not left
+    tensor[1, :, 4] = 0.05  # the second policy never goes up there
+    ends = {"start": grid.centre_of(0, 0), "goal": grid.centre_of(8, 4)}
+    options = {"tensors": tensor, "switch_cost": switch_cost, "settings": PAPER}
+    refusal = planning.plan(*fuse(tensor), grid=grid, **ends, **options)
+    assert isinstance(refusal.error, UnreachableError)
+    assert refusal.nearest == pytest.approx(grid.centre_of(3, 4))
+    assert directions.NAMES[refusal.heading] == "+x"
+    assert point_text(refusal.nearest, RESOLUTION) in refusal.reason
+
+
 def test_our_settings_are_the_default_and_the_papers_have_a_name():
     walker, climber = two_specialists()
     fused, policy_map = fuse([walker, climber])

@@ -69,8 +69,10 @@ def run(config: PlanConfig) -> int:
         )
     if config.figure and planned.tensors:  # of a refusal too: it shows where the ground is closed
         save_figure(plan_figure(elevation, planned, f_min=settings.f_min), config.figure)
-    if config.json:
+    if config.json and planned.answer:
         write_json(config.json, planned.route.to_json())
+    for reason in planned.why_not(elevation):
+        print(reason)
     print(planned.route)
     for what, path in (("route", config.json), ("figure", config.figure)):
         if path:

@@ -101,6 +101,8 @@ def plan_and_drive(
     if plan.tensors:
         save_figure(plan_figure(elevation, plan, f_min=settings.f_min), out / "plan.png")
         announce("plan.png", "the map and route, w_ood, F_max and the policy map")
+    for reason in plan.why_not(elevation):
+        print(reason)
     route = plan.route
 
     with waiting("driving the route"):

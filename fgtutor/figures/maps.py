@@ -228,9 +228,7 @@ def plan_figure(elevation: ElevationMap, plan: Plan, *, f_min: float = 0.1) -> P
 
     Raises `ConfigError` if the plan holds no w_ood of a policy.
     """
-    weights = plan.weights
-    missing = [name for name in plan.names if name not in weights]
-    if missing:
+    if missing := [name for name in plan.names if name not in plan.weights]:
         raise ConfigError(f"plan_figure needs w_ood of every policy, got none of {missing}")
     width, height = _size(elevation, 7.2)
     figure = Picture(2 * width, 2 * height)
@@ -240,8 +238,9 @@ def plan_figure(elevation: ElevationMap, plan: Plan, *, f_min: float = 0.1) -> P
     draw_elevation(elevation, axes=first)
     if isinstance(plan.answer, Route):
         draw_route(plan.answer, elevation, axes=first)
-    else:
-        first.set_title("No route", **TITLE, loc="left")
+    elif plan.answer.nearest:
+        first.plot(*plan.answer.nearest, "X", color=BLOCKED, markersize=11)
+        first.set_title("No route leads nearer to the goal than X", **TITLE, loc="left")
     columns = int(np.ceil(np.sqrt(len(plan.names))))
     rows = -(-len(plan.names) // columns)
     panels[0, 1].suptitle("2  Have I seen this before? w_ood of each policy", **TITLE, x=0.02)
@@ -249,11 +248,11 @@ def plan_figure(elevation: ElevationMap, plan: Plan, *, f_min: float = 0.1) -> P
     panels[0, 1].supxlabel(caption, fontsize=9)
     small = panels[0, 1].subplots(rows, columns, squeeze=False).ravel()
     for axes, name in zip(small, plan.names, strict=False):
-        draw_weight(weights[name], elevation, name, axes=axes, bare=True)
+        draw_weight(plan.weights[name], elevation, name, axes=axes, bare=True)
         axes.set_title(name, **TITLE | {"color": policy_colours([name])[name]}, loc="left")
     for axes in small[len(plan.names) :]:
         axes.remove()
-    third, fourth = panels[1, 0].subplots(), panels[1, 1].subplots()
+    third, fourth = (panel.subplots() for panel in panels[1])
     draw_petals(plan.fused, elevation, plan.policy_map, plan.names, f_min=f_min, axes=third)
     draw_policy_map(plan.policy_map, plan.fused, elevation, plan.names, f_min=f_min, axes=fourth)
     for axes, number in ((first, 1), (third, 3), (fourth, 4)):
