@@ -230,8 +230,7 @@ def plan_figure(elevation: ElevationMap, plan: Plan, *, f_min: float = 0.1) -> P
     """
     if missing := [name for name in plan.names if name not in plan.weights]:
         raise ConfigError(f"plan_figure needs w_ood of every policy, got none of {missing}")
-    width, height = _size(elevation, 7.2)
-    figure = Picture(2 * width, 2 * height)
+    figure = Picture(*np.multiply(2, _size(elevation, 7.2)).tolist())
     panels = cast(np.ndarray, figure.subfigures(2, 2, wspace=0.02, hspace=0.02))
 
     first = panels[0, 0].subplots()
