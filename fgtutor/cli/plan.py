@@ -21,30 +21,41 @@ from fgtutor.specialist import Specialist, load_zoo
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanConfig(PlanOptions):
-    """Plan a route over an elevation map with the shipped specialists."""
+class MapOptions(PlanOptions):
+    """What is planned over, from where to where, and by whose specialists."""
 
     map: Path
-    """Elevation map: .npz, .tif, or .png with its .yaml."""
+    """Elevation map: .npz, .tif, or .png with its .yaml; `fgtutor map` makes one of a scan."""
     start: Point
     """Start x y, m."""
     goal: Point
     """Goal x y, m."""
     robot: str = "toy"
-    """Whose specialists plan."""
+    """Whose specialists."""
     zoo: Path | None = None
     """Folder of specialist folders; default: the shipped zoo of the robot."""
     policies: Annotated[tuple[str, ...], Unique] = ()
     """Use only these specialists; default: all."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def load(self) -> tuple[ElevationMap, dict[str, Specialist]]:
+        """Return the map and the specialists."""
+        elevation = ElevationMap.load(self.map)
+        return elevation, choose(load_zoo(self.robot, self.zoo), self.policies)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanConfig(MapOptions):
+    """Plan a route over an elevation map with the shipped specialists."""
+
     backend: Backend = "auto"
     """Which library searches."""
     json: Path | None = None
     """Write the route here."""
     figure: Path | None = None
     """Draw the plan here: the map with the route, w_ood, F_max and the policy map."""
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 def choose(zoo: dict[str, Specialist], names: tuple[str, ...]) -> dict[str, Specialist]:
@@ -60,8 +71,7 @@ def run(config: PlanConfig) -> int:
     for path in (config.json, config.figure):
         if path:
             check_writable(path)
-    elevation = ElevationMap.load(config.map)
-    zoo = choose(load_zoo(config.robot, config.zoo), config.policies)
+    elevation, zoo = config.load()
     with torch.inference_mode():
         settings = replace(config.planning, backend=config.backend)
         planned = plan_on_map(

@@ -9,12 +9,11 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
 
-from fgtutor.cli.plan import choose
-from fgtutor.elevation import ElevationMap
+from fgtutor.cli.plan import MapOptions
 from fgtutor.errors import RenderingError
 from fgtutor.execution import Episode, FollowConfig, execute
 from fgtutor.figures.maps import plan_figure
@@ -22,47 +21,33 @@ from fgtutor.figures.style import save_figure
 from fgtutor.figures.videos import film_strip, save_video
 from fgtutor.io.progress import waiting
 from fgtutor.io.storage import atomic_write, make_folder, write_json
-from fgtutor.io.validation import Seed, Unique, check_fields
-from fgtutor.planning import Point, plan_on_map
+from fgtutor.io.validation import Seed
+from fgtutor.planning import plan_on_map
 from fgtutor.routes import Route
-from fgtutor.settings import PlanOptions, PlanSettings
-from fgtutor.specialist import Specialist, load_zoo
+from fgtutor.settings import PlanSettings
+from fgtutor.specialist import Specialist
 from fgtutor.world.terrain import Terrain
 
 Video = Literal["mp4", "gif"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class WalkConfig(PlanOptions):
+class WalkConfig(MapOptions):
     """Plan over an elevation map with the shipped specialists, drive the route, and draw both."""
 
-    map: Path
-    """Elevation map: .npz, .tif, or .png with its .yaml; `fgtutor map` makes one of a scan."""
-    start: Point
-    """Start x y, m."""
-    goal: Point
-    """Goal x y, m."""
     robot: str = "a1"
     """Whose specialists plan and drive: the A1 in MuJoCo, or the toy."""
-    policies: Annotated[tuple[str, ...], Unique] = ()
-    """Use only these specialists; default: all."""
     out: Path = Path("walk")
     """Folder that everything is written to."""
     seed: Seed = 0
     """Seed of the robot's start position and yaw."""
-    zoo: Path | None = None
-    """Folder of specialist folders; default: the shipped zoo of the robot."""
     video: Video = "mp4"
     """Format of the film."""
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 def run(config: WalkConfig) -> int:
     """Plan and drive; return 0 if the robot reached its goal, else 1 (the film shows why)."""
-    zoo = choose(load_zoo(config.robot, config.zoo), config.policies)
-    elevation = ElevationMap.load(config.map)
+    elevation, zoo = config.load()
     terrain = Terrain.from_elevation(elevation, config.start, config.goal, robot=config.robot)
     return plan_and_drive(
         terrain, zoo, config.planning, out=config.out, seed=config.seed, video=config.video
