@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     from fgtutor.execution import execute
     from fgtutor.fusion import fuse
     from fgtutor.learning.training import train
-    from fgtutor.planning import plan
+    from fgtutor.planning import plan, plan_on_map
+    from fgtutor.settings import PAPER, PlanSettings
     from fgtutor.specialist import Specialist, load_specialist, load_zoo
     from fgtutor.tensorization import assess, tensorize
     from fgtutor.world.terrain import Terrain, make_terrain
@@ -49,7 +50,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "PAPER",
     "ElevationMap",
+    "PlanSettings",
     "Specialist",
     "Terrain",
     "__version__",
@@ -61,12 +64,15 @@ __all__ = [
     "load_zoo",
     "make_terrain",
     "plan",
+    "plan_on_map",
     "tensorize",
     "train",
 ]
 
 _HOMES = {
+    "PAPER": "settings",
     "ElevationMap": "elevation",
+    "PlanSettings": "settings",
     "Specialist": "specialist",
     "Terrain": "world.terrain",
     "assess": "tensorization",
@@ -76,6 +82,7 @@ _HOMES = {
     "load_zoo": "specialist",
     "make_terrain": "world.terrain",
     "plan": "planning",
+    "plan_on_map": "planning",
     "tensorize": "tensorization",
     "train": "learning.training",
 }
