@@ -271,9 +271,8 @@ class Search:
         reached = np.zeros(shape, dtype=bool)
         for layer in range(shape[0]):
             first = int(np.ravel_multi_index((layer, *start), shape))
-            reached.flat[csgraph.breadth_first_order(graph, first, return_predecessors=False)] = (
-                True
-            )
+            states = csgraph.breadth_first_order(graph, first, return_predecessors=False)
+            reached.flat[states] = True
         return np.logical_or.reduce(reached)
 
     def _reversed(self) -> csr_array:

@@ -103,15 +103,18 @@ class Plan:
         """
         if isinstance(self.answer, Route) or self.answer.nearest is None:
             return []
-        at = (*elevation.cell_of(*self.answer.nearest), self.answer.heading or 0)
+        at = (*elevation.cell_of(*self.answer.nearest), self.answer.heading)
         if not elevation.known_steps[at]:
             return ["The step on from there leads onto ground that was never observed."]
         place = point_text(self.answer.nearest, elevation.resolution)
         reasons = [f"On from {place} m towards {directions.NAMES[at[-1]]}:"]
         for name, tensor in zip(self.names, self.tensors, strict=True):
-            F, w_ood = float(tensor[at]), float(self.weights[name][at])
-            known = "it knows such ground" if w_ood >= 0.5 else "it has hardly seen such ground"
-            reasons.append(f"{name}: F = {F:.2f}, w_ood = {w_ood:.2f} ({known})")
+            reason = f"{name}: F = {float(tensor[at]):.2f}"
+            if name in self.weights:  # not of a tensor that was given
+                w_ood = float(self.weights[name][at])
+                known = "it knows such ground" if w_ood >= 0.5 else "it has hardly seen such ground"
+                reason += f", w_ood = {w_ood:.2f} ({known})"
+            reasons.append(reason)
         return reasons
 
 
@@ -148,9 +151,7 @@ def plan_on_map(
     asked = {name: one for name, one in zoo.items() if name not in known}
     assessments = assess_all(elevation, asked, taus=settings.taus, progress=progress)
     for name in asked:  # each is let go as soon as it is weighted: large maps need the memory
-        assessment = assessments.pop(name)
-        weights[name] = assessment.ood()
-        known[name] = assessment.weighted(unknown=settings.unknown)
+        weights[name], known[name] = assessments.pop(name).weigh(unknown=settings.unknown)
     each = [known[name] for name in zoo]
     fused, policy_map = fuse(each)
     states = elevation.heights.size * (len(zoo) if settings.switch_cost else 1)
@@ -259,8 +260,8 @@ class _Problem:
             raise ConfigError(f"each policy needs a name of its own, got {names!r}")
         # What is searched: F where there is an edge, 0 elsewhere. One layer, F_max, while switching
         # is free: then P decides. Else one layer per policy.
-        paid = settings.switch_cost > 0 and self.tensors is not None
-        layers = self.tensors if paid and self.tensors is not None else self.fused[None]
+        paid = self.tensors if settings.switch_cost > 0 else None
+        layers = self.fused[None] if paid is None else paid
         layers = layers.astype(np.result_type(layers.dtype, np.float32), copy=False)
         known = grid.known_steps
         if settings.unknown == "fill":
@@ -325,17 +326,15 @@ class _Problem:
         headings = headings_of(cells)
         at = (*cells[:-1].T, headings)
         x, y = self.grid.centres
-        paid = self.settings.switch_cost > 0
-        policies = layer[1:] if paid else self.policy_map[at]
-        source = self.tensors if paid and self.tensors is not None else self.fused[None]
-        feasibility = source[(layer[1:], *at)]
+        policies = layer[1:] if self.settings.switch_cost > 0 else self.policy_map[at]
+        feasibility = self.layers[(layer[1:], *at)]
         costs = step_cost(feasibility, headings, self.settings.cost, self.grid.resolution)
         return Route(
             cells=cells,
             xy=np.stack((x[cells[:, 0]], y[cells[:, 1]]), axis=-1),
             headings=headings,
             policies=policies,
-            feasibility=feasibility.astype(self.layers.dtype, copy=False),
+            feasibility=feasibility,
             costs=costs + self.settings.switch_cost * (np.diff(layer) != 0),
             length=float(directions.STEP_LENGTHS[headings].sum() * self.grid.resolution),
             names=self.names,

@@ -30,7 +30,7 @@ class Refusal:
     """The reason, by its type: `UnknownCellError`, `InfeasibleCellError`, `UnreachableError`."""
     nearest: tuple[float, float] | None = None
     """The place nearest to the goal that can be reached, m, if start and goal can be used."""
-    heading: int | None = None
+    heading: int = 0
     """The heading from there that leads towards the goal."""
 
     @property

@@ -77,8 +77,19 @@ class Assessment:
         It is 0 where a step would start from or end on an unknown cell, or leave the map;
         `unknown="fill"` trusts the filled heights instead.
         """
-        weighted = self.ood(tau_low, tau_high) * self.f
-        return self.closed(weighted) if unknown == "block" else weighted
+        return self.weigh(tau_low, tau_high, unknown=unknown)[1]
+
+    def weigh(
+        self,
+        tau_low: float | None = None,
+        tau_high: float | None = None,
+        *,
+        unknown: Unknown = "block",
+    ) -> tuple[Float[Tensor, "nx ny 8"], Float[Tensor, "nx ny 8"]]:
+        """Return w_ood and F_i, as `ood` and `weighted` do, computing w_ood once."""
+        w_ood = self.ood(tau_low, tau_high)
+        weighted = w_ood * self.f
+        return w_ood, self.closed(weighted) if unknown == "block" else weighted
 
     def closed(self, values: Float[Tensor, "nx ny 8"]) -> Float[Tensor, "nx ny 8"]:
         """Return `values`, 0 for steps from or to an unknown cell or off the map."""

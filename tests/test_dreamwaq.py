@@ -128,7 +128,7 @@ def test_a_blind_robot_does_not_see_the_ground(robot):
         env = make_env(robot, name, num_envs=1, train=False)
         # On level ground; the obstacle begins at 1.5 m, within sight.
         pose = torch.tensor([[1.0, 2.0, 0.0]])
-        pose[:, :2] += env.tile_corner(torch.arange(1))
+        pose[:, :2] += env.crossings.corner(torch.arange(1))
         env.start(torch.arange(1), pose, 0.5)
         seen[name] = env.get_observations()
     assert not torch.allclose(seen["flat"]["patch"], seen["steps"]["patch"], atol=1e-3)

@@ -143,6 +143,7 @@ def test_a_refusal_says_for_each_policy_what_it_finds_there(case, make_rolling, 
         "a: F = 0.05, w_ood = 0.90 (it knows such ground)",
         "b: F = 0.00, w_ood = 0.00 (it has hardly seen such ground)",
     ]
+    assert plan.why_not(elevation)[1:] == ["a: F = 0.05", "b: F = 0.00"]  # of given tensors
     assert plan_on_map(elevation, zoo, (0.15, 0.45), (0.25, 0.45)).why_not(elevation) == []
 
 

@@ -104,7 +104,7 @@ def test_a_restored_environment_continues_as_the_original(robot):
 def test_placing_puts_robots_where_asked(robot):
     env = make_env(robot, "flat", train=False)
     poses = torch.tensor([[2.0, 2.0, 0.0], [3.0, 1.0, 1.0], [4.0, 2.5, -2.0], [5.0, 2.0, math.pi]])
-    poses[:, :2] += env.tile_corner(torch.arange(4))
+    poses[:, :2] += env.crossings.corner(torch.arange(4))
     env.start(torch.arange(4), poses, 0.5)
     pose, velocity = env.motion()
     assert torch.allclose(pose[:, [0, 1]], poses[:, :2], atol=1e-3)
@@ -118,7 +118,7 @@ def test_placing_puts_robots_where_asked(robot):
 def test_a_robot_that_does_nothing_neither_falls_nor_leaves(robot):
     env = make_env(robot, "flat", train=False)
     poses = torch.tensor([[4.0, 2.0, 0.7]]).repeat(4, 1)
-    poses[:, :2] += env.tile_corner(torch.arange(4))
+    poses[:, :2] += env.crossings.corner(torch.arange(4))
     env.start(torch.arange(4), poses, 0.0)
     for _ in range(round(2.0 / env.control_dt)):
         *_, extras = env.step(torch.zeros(4, env.num_actions))
@@ -133,7 +133,7 @@ def test_patches_are_those_of_the_planner(robot):
     env = env_class(robot)(World([[terrain]]), 3, config=EnvConfig(train=False))
     places = torch.tensor([[0.1, 0.1, 0.5], [2.0, 2.0, 0.0], [4.3, 3.9, 2.0]])
     poses = places.clone()
-    poses[:, :2] += env.tile_corner(torch.arange(3))
+    poses[:, :2] += env.crossings.corner(torch.arange(3))
     env.start(torch.arange(3), poses, 0.5)
     own = patches.prepare(terrain.elevation)
     expected = sample_patches(
@@ -159,7 +159,7 @@ def test_waiting_ends_an_episode_as_a_failure_without_reward(robot):
 def test_leaving_the_tile_is_a_time_out_and_not_a_failure(robot):
     env = make_env(robot, "flat", train=False)
     poses = torch.tensor([[-0.05, 2.0, 0.0]]).repeat(4, 1)
-    poses[:, :2] += env.tile_corner(torch.arange(4))
+    poses[:, :2] += env.crossings.corner(torch.arange(4))
     env.start(torch.arange(4), poses, 0.0)
     observations, _, done, extras = env.step(torch.zeros(4, env.num_actions))
     assert done.all() and extras["time_outs"].all() and not observations["tracking"][:, 1].any()
@@ -170,7 +170,7 @@ def test_between_neighbours_robots_stay_off_them(robot):
     terrain = make_terrain("gaps", robot=robot, seed=3, neighbours=True)
     assert terrain.limits is not None
     env = env_class(robot)(World([[terrain]]), 256, config=EnvConfig())
-    x = env.motion()[0][:, 0] - env.tile_corner(torch.arange(256))[:, 0]
+    x = env.motion()[0][:, 0] - env.crossings.corner(torch.arange(256))[:, 0]
     assert ((terrain.limits[0] < x) & (x < terrain.limits[1])).all()
     backwards = torch.cos(env.crossings.target_yaw) < 0
     assert torch.allclose(x[env.crossings.crossing & ~backwards], torch.tensor(terrain.start[0]))
@@ -198,8 +198,9 @@ def test_between_neighbours_crossings_begin_with_all_feet_on_the_landing(robot):
 def test_crossings_begin_anywhere_up_to_their_run_up(robot):
     terrain = make_terrain("bridge", robot=robot, seed=3)
     env = env_class(robot)(World([[terrain]]), 512, config=EnvConfig(run_up=0.6))
-    x = (env.motion()[0][:, 0] - env.tile_corner(torch.arange(512))[:, 0])[env.crossings.crossing]
-    forwards = torch.cos(env.crossings.target_yaw[env.crossings.crossing]) > 0
+    crossing = env.crossings.crossing
+    x = (env.motion()[0][:, 0] - env.crossings.corner(torch.arange(512))[:, 0])[crossing]
+    forwards = torch.cos(env.crossings.target_yaw[crossing]) > 0
     for side, last in (
         (x[forwards], terrain.span[0] - 0.6),
         (-x[~forwards], -terrain.span[1] - 0.6),
@@ -217,7 +218,7 @@ def test_going_on_to_a_neighbours_obstacle_is_infeasible_but_no_fault(robot):
     env = env_class(robot)(World([[terrain]]), 2, config=EnvConfig(train=False))
     last = torch.tensor([terrain.limits[1] + 0.02, 2.0, 0.0])
     poses = torch.stack((last, last - torch.tensor([0.5, 0.0, 0.0])))
-    poses[:, :2] += env.tile_corner(torch.arange(2))
+    poses[:, :2] += env.crossings.corner(torch.arange(2))
     env.start(torch.arange(2), poses, 0.0)
     observations, _, done, extras = env.step(torch.zeros(2, env.num_actions))
     assert done.tolist() == [1, 0] and extras["time_outs"].tolist() == [1.0, 0.0]
@@ -265,7 +266,7 @@ def test_a_crossing_is_steered_along_the_lane_at_its_distance(robot):
     env = env_class(robot)(World([[terrain]]), 3, config=config)
     beam = terrain.lane[1][1]
     (x0, _), (x1, _) = terrain.lane[1:3]
-    corner = env.tile_corner(torch.arange(1))[0]
+    corner = env.crossings.corner(torch.arange(1))[0]
     places = torch.tensor([[(x0 + x1) / 2, beam + side, 0.0] for side in (-0.1, 0.0, 0.1)])
     places[:, :2] += corner
     env.start(torch.arange(3), places, 0.5)

@@ -15,7 +15,7 @@ def on(heights, poses, speed=0.8):
     terrain = Terrain.from_elevation(ElevationMap(np.asarray(heights, dtype=float)), (1, 1), (2, 1))
     env = ToyEnv(World([[terrain]]), len(poses), config=EnvConfig(train=False))
     poses = torch.tensor(poses, dtype=torch.float32)
-    poses[:, :2] += env.tile_corner(torch.arange(len(poses)))
+    poses[:, :2] += env.crossings.corner(torch.arange(len(poses)))
     env.start(torch.arange(len(poses)), poses, speed)
     return env
 
@@ -30,7 +30,7 @@ def roll(env, seconds, action=(0.0, 0.0, 0.0, 0.0)):
 
 
 def place(env):
-    return (env.motion()[0][:, :2] - env.tile_corner(torch.arange(env.num_envs))).numpy()
+    return (env.motion()[0][:, :2] - env.crossings.corner(torch.arange(env.num_envs))).numpy()
 
 
 FLAT = np.zeros((60, 30))
@@ -121,7 +121,7 @@ def test_a_robot_off_its_line_has_failed_and_on_a_route_there_is_no_line(train):
     terrain = Terrain.from_elevation(ElevationMap(FLAT), (1, 1), (2, 1))
     env = ToyEnv(World([[terrain]]), 3, config=EnvConfig(train=train))
     poses = torch.tensor([(2.0, 1.5, 0.0)] * 3)
-    poses[:, :2] += env.tile_corner(torch.arange(3))
+    poses[:, :2] += env.crossings.corner(torch.arange(3))
     env.start(torch.arange(3), poses, 0.8)
     env.crossings.anchor[1, 1] += (
         0.9  # its line lies 0.9 m to its left, the third's 1.1 m to its right

@@ -24,13 +24,20 @@ from typing import Any
 from fgtutor.evaluation.cost import Cost
 from fgtutor.evaluation.shards import Run, RunConfig, collect, finished
 from fgtutor.evaluation.tasks import Task
+from fgtutor.figures.charts import draw_shares
 from fgtutor.io.machine import usable_cores
 from fgtutor.io.storage import atomic_write, locked_folder, make_folder, write_json
+from fgtutor.statistics import Share
 
 TABLE, ROWS, RUN, FIGURES = "table.md", "rows.json", "run.json", "figures"
 
 Draw = Callable[[Path], object]
-"""Writes a figure to a path: `figure.savefig`, or `lambda path: path.write_text(svg)`."""
+"""Draws a figure into a file."""
+
+
+def shares_chart(groups: Mapping[str, Mapping[str, Share]], title: str) -> Draw:
+    """Return what draws shares within groups, when and if the report is written."""
+    return lambda path: draw_shares(groups, title=title).savefig(path)
 
 
 def markdown(columns: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:

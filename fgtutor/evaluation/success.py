@@ -18,7 +18,6 @@ from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.report import Findings
 from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.evaluation.trials import Ground, PlannedConfig, TrialRow, by_cell, drive
-from fgtutor.figures.charts import draw_shares
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.statistics import Share
 from fgtutor.world.terrain import Terrain, make_terrain
@@ -169,11 +168,10 @@ def run_and_report(
             f"Success in % with 95 % intervals, {config.count:,} trials per cell; robot "
             f"{config.robot}, protocol {config.protocol}, {config.planning}, seed {config.seed}."
         )
-        chart = draw_shares(shares, title=title)
         return Findings(
             table=table(trials),
             caption=f"{caption} {remark(trials)}" if remark else caption,
-            figures={"success.svg": chart.savefig},
+            figures={"success.svg": report.shares_chart(shares, title)},
         )
 
     # By the paper's protocol, their number says which trials a ground is for.

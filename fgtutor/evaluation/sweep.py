@@ -32,7 +32,6 @@ from fgtutor.evaluation.shards import RunConfig, digest, settings_of
 from fgtutor.evaluation.success import TrialsConfig, cut, make_ground
 from fgtutor.evaluation.tasks import Row, Task
 from fgtutor.evaluation.trials import by_cell, drive
-from fgtutor.figures.charts import draw_shares
 from fgtutor.io.machine import usable_cores
 from fgtutor.io.storage import make_folder
 from fgtutor.io.validation import Seed, Unique
@@ -280,13 +279,12 @@ def run(config: SweepConfig) -> int:
         for (terrain, setting, seed), crossings in by_cell(rows, CELL).items():
             group = " ".join(filter(None, (terrain, option, setting)))
             groups.setdefault(group, {})[f"seed {seed}"] = Share.reached(crossings)
-        chart = draw_shares(groups, title=title)
         return Findings(
             table=table(rows, option),
             caption=f"Success in % with 95 % intervals, {config.trials} crossings of held-out "
-            f"terrain a training, each with its own plan; r_v and calibration error there are "
+            f"terrain per training, each with its own plan; r_v and calibration error there are "
             f"means over the seeds; robot {config.robot}{iterations}.",
-            figures={"success.svg": chart.savefig},
+            figures={"success.svg": report.shares_chart(groups, title)},
         )
 
     make_folder(config.folder)

@@ -21,7 +21,7 @@ from fgtutor.baselines import OURS, Planner, ours, single
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import TerrainError
 from fgtutor.evaluation.cost import Cost, estimate
-from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
+from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report, shares_chart
 from fgtutor.evaluation.success import cut, terrain_seed
 from fgtutor.evaluation.tasks import Task
 from fgtutor.evaluation.trials import (
@@ -38,7 +38,6 @@ from fgtutor.evaluation.trials import (
     plan_all,
 )
 from fgtutor.execution import FollowConfig
-from fgtutor.figures.charts import draw_shares
 from fgtutor.io.validation import Count, Positive, Unique, check_arguments
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.robots import ROBOTS
@@ -278,9 +277,8 @@ def charts(trials: Sequence[SwitchingRow]) -> dict[str, Draw]:
         for (course, planner), cell in by_cell(level, ("course", "policy")).items():
             groups.setdefault(course, {})[planner] = Share.reached(cell)
         title = f"Fixes off by {100 * noise:g} cm, drift {100 * drift:g} cm per root second"
-        chart = draw_shares(groups, title=title)
         name = f"success-{100 * noise:g}-{100 * drift:g}.svg"
-        figures[name] = chart.savefig
+        figures[name] = shares_chart(groups, title)
     return figures
 
 

@@ -262,10 +262,6 @@ class LocomotionEnv(VecEnv):
         self.command[:, 0] = self.cruise * slowdown(wanted, yaw, self.config.slowest)
         self.command[:, 2] = turn_rate(wanted, yaw, self.config.max_turn_rate)
 
-    def tile_corner(self, ids: Int[Tensor, "n"]) -> Float[Tensor, "n 2"]:
-        """Return the world position of the corner (0, 0) of each robot's present tile, m."""
-        return self.crossings.corner(ids)
-
     def patches(self) -> Float[Tensor, "envs points"]:
         """Return the height patch H_xy under every robot, looking along its yaw."""
         return self.patches_at(self.motion()[0][:, [0, 1, 3]])

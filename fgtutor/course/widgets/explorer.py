@@ -105,8 +105,7 @@ class Explorer:
         weights, tensors = {}, []
         for name, one in self.assessments.items():
             taus = _thresholds(settings, one)
-            weights[name] = one.ood(*taus)
-            tensor = one.weighted(*taus, unknown=settings.unknown)
+            weights[name], tensor = one.weigh(*taus, unknown=settings.unknown)
             tensors.append(tensor * (name in policies))
         fused, policy_map = fuse(tensors)
         answer = plan(

@@ -146,12 +146,10 @@ class Painting:
         """Return a cell's numbers; raises `ConfigError` off the map."""
         check_cell(self.elevation, cell)
         assessment = self.assessment
+        w_ood, F = assessment.weigh()
         tensors = {
-            "f": assessment.f,
-            "L_recon": assessment.reconstruction,
-            "w_ood": assessment.ood(),
-            "F": assessment.weighted(),
-        }
+            "f": assessment.f, "L_recon": assessment.reconstruction, "w_ood": w_ood, "F": F
+        }  # fmt: skip
         rows = {label: tensor[cell].tolist() for label, tensor in tensors.items()}
         return cell_table(self.elevation, cell, rows)
 
