@@ -1,10 +1,11 @@
 """One default everywhere: whoever plans on a map by settings of one name gets the same route."""
 
+import ast
 import importlib
 import json
 import re
 import shlex
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from fgtutor.planning import PAPER, SETTINGS, PlanSettings, plan_on_map
 from fgtutor.settings import PlanOptions
 
 ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks" / "src").glob("[01]*.py"))
 PLANNING = ("demo", "plan", *(name for name in COMMANDS if name.startswith("evaluate ")))
 # Calibration only weighs, and switching compares what each of our additions buys.
 PLANNING = tuple(name for name in PLANNING if name.split()[-1] not in ("calibration", "switching"))
@@ -140,6 +142,43 @@ def test_as_the_sliders_plan(asked, ground, zoo):
     name, expected = asked
     explorer = Explorer(ground.elevation, zoo, ground.start, ground.goal, SETTINGS[name])
     assert explorer.route is not None and same(explorer.route.to_json(), expected)
+
+
+def test_as_the_readme_plans(ground, zoo, monkeypatch, capsys):
+    expected = plan_on_map(ground.elevation, zoo, ground.start, ground.goal).route
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    monkeypatch.setattr("fgtutor.make_terrain", lambda *_, **__: ground)
+    monkeypatch.setattr("fgtutor.execute", lambda *_, **__: None)
+    names: dict = {}
+    exec(example, names)
+    assert same(names["route"].to_json(), expected)
+
+
+def settings_given(source: str) -> list[str]:
+    """Return what a notebook's calls of the planner set by hand, as written."""
+    planners = {"plan", "plan_on_map", "find_route", "drive", "tensorize", "assess", "AssessedMap"}
+    names = {one.name for one in fields(PlanSettings)} | {"settings"}
+    calls = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
+    return [
+        ast.unparse(keyword)
+        for call in calls
+        if isinstance(call.func, ast.Name) and call.func.id in planners
+        for keyword in call.keywords
+        if keyword.arg in names
+    ]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem[:2])
+def test_notebooks_plan_by_our_settings_but_where_another_is_the_subject(path):
+    """06 shows the paper's beside ours, 10 varies f_min, 12 the price of a switch."""
+    subject = {
+        "06": ["settings=PAPER"] * 2,
+        "10": ["f_min=f_min"],
+        "12": ["switch_cost=switch_cost"],
+    }
+    ours_said_aloud = ("taus='calibrated'", "settings=PlanSettings()")
+    given = [one for one in settings_given(path.read_text()) if one not in ours_said_aloud]
+    assert given == subject.get(path.stem[:2], [])
 
 
 def test_no_command_of_a_table_needs_an_option_to_plan_as_the_table_did():
