@@ -96,6 +96,9 @@ class LocomotionEnv(VecEnv):
         self.cruise = torch.zeros(num_envs, device=device)
         self.tracking = torch.zeros(num_envs, 3, device=device)
         self.return_r_v = torch.zeros(num_envs, device=device)
+        self.displacement = torch.zeros(num_envs, 2, device=device)
+        """Where each robot takes itself to be, minus where it is (x, y), m: its map is read there.
+        Whoever drives may write it; it moves what is seen, not the physics."""
         self.history = None
         if self.config.history:
             if len(self.unfelt) != VELOCITY:
@@ -264,7 +267,9 @@ class LocomotionEnv(VecEnv):
 
     def patches(self) -> Float[Tensor, "envs points"]:
         """Return the height patch H_xy under every robot, looking along its yaw."""
-        return self.patches_at(self.motion()[0][:, [0, 1, 3]])
+        poses = self.motion()[0][:, [0, 1, 3]]
+        poses[:, :2] += self.displacement
+        return self.patches_at(poses)
 
     def patches_at(self, poses: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch points"]:
         """Return the height patches at poses (x, y, yaw) in the world."""

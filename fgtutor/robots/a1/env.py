@@ -21,6 +21,7 @@ from torch import Tensor
 
 from fgtutor.patches import PatchGrid, ground_height, rotate, sample_heights
 from fgtutor.robots.a1 import observation, rewards
+from fgtutor.robots.a1.footing import FEET, stand
 from fgtutor.robots.a1.ground import edges
 from fgtutor.robots.a1.model import (
     FOOT_RADIUS,
@@ -30,9 +31,10 @@ from fgtutor.robots.a1.model import (
     sensor_slices,
     world_spec,
 )
-from fgtutor.robots.a1.observation import NOISE, SCAN_GRID, SCAN_LIMIT, SCAN_NOISE, SCAN_SCALE
+from fgtutor.robots.a1.observation import NOISE, SCAN_GRID, SCAN_LIMIT, SCAN_SCALE
 from fgtutor.robots.a1.physics import Physics
-from fgtutor.robots.a1.randomise import A1EnvConfig, randomise
+from fgtutor.robots.a1.randomise import A1EnvConfig, Bodies, randomise
+from fgtutor.robots.a1.sensing import Senses
 from fgtutor.robots.base import Layout, LocomotionEnv
 from fgtutor.robots.crossings import EnvConfig
 from fgtutor.world.terrain import World
@@ -41,10 +43,6 @@ A1_GRID = PatchGrid(ahead=0.8, behind=0.8, half_width=0.5)
 """The A1's patch: 17 x 11 points, 1.6 m x 1.0 m."""
 LOOK_GRID = PatchGrid(ahead=0.9, behind=0.8, half_width=0.5)
 """The patch and the policy's scan (`SCAN_GRID`), sampled at once."""
-FEET = ((0.17, -0.155), (0.17, 0.155), (-0.22, -0.155), (-0.22, 0.155))
-"""Where the feet stand in the stance, in the yaw frame, m; legs in the order of `LEGS`."""
-MAX_SLOPE = 0.6
-"""Steepest ground a robot is tilted to when it is placed; rise over run."""
 MAX_TILT = 1.2
 """A trunk tilted further than this has fallen, rad."""
 DROP = 0.35
@@ -121,12 +119,18 @@ class A1Env(LocomotionEnv):
             torch.cat([torch.full((row[0],), row[k]) for row in NOISE.values()]).to(device)
             for k in (1, 2)
         )
+        self.noise *= self.settings.noise_share
+        if self.settings.velocity != "true":  # its errors are another kind
+            self.noise[: NOISE["velocity"][0]] = 0.0
         self.last_action = torch.zeros(num_envs, 12, device=device)
         self.action_change = torch.zeros(num_envs, 12, device=device)
         self.clock = torch.zeros(num_envs, device=device)
         self.exploded = torch.zeros(num_envs, dtype=torch.bool)
         self.explosions = 0
-        self.late = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)
+        self.senses = Senses(self.settings, num_envs, self.control_dt, self.uniform, device)
+        remembered = math.ceil(self.settings.delay[1] / self.control_dt) + 1
+        self.targets = self.stance.expand(num_envs, remembered, 12).clone()
+        self.late, self.delay, self.traits = Bodies.alike(num_envs)
         self.body_seed = seed
         self._randomise()
         self.reset_all()
@@ -136,7 +140,8 @@ class A1Env(LocomotionEnv):
     def _randomise(self) -> None:
         """Make every simulation another robot on another ground, once for all its episodes."""
         if self.settings.randomise:
-            self.late = randomise(self.physics, self.settings, self.body_seed).to(self.device)
+            bodies = randomise(self.physics, self.settings, self.body_seed)
+            self.late, self.delay, self.traits = (value.to(self.device) for value in bodies)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what training must store to continue, and which robots it had drawn."""
@@ -161,13 +166,29 @@ class A1Env(LocomotionEnv):
         applied = torch.where(self.late, self.last_action, action)
         self.action_change, self.last_action = action - self.last_action, action
         target = self.stance + self.settings.action_scale * applied
-        self.physics.ctrl.copy_(target)
-        if self.settings.randomise:
+        if self.settings.randomise and self.settings.push_speed:
             self._push()
-        self.physics.step(self.settings.substeps)
+        self._simulate(target)
         self.clock = (self.clock + self.settings.gait_frequency * self.control_dt).remainder(1.0)
         self._read()
+        force = self._feet("foot_force").norm(dim=-1)
+        self.senses.advance(self.q[:, 7:], self.v[:, 6:], self.v[:, 3:6], self.up, force)
         self._count_explosions(broken.cpu())
+
+    def _simulate(self, target: Float[Tensor, "envs 12"]) -> None:
+        """Simulate one control step, in which each robot's target changes after its delay."""
+        target = target - self.senses.encoder
+        steps = self.settings.substeps
+        if not self.delay.any():
+            self.physics.ctrl.copy_(target)
+            self.physics.step(steps)
+            return
+        self.targets = torch.cat((target[:, None], self.targets[:, :-1]), dim=1)  # newest first
+        everyone = torch.arange(self.num_envs, device=self.device)
+        for step in range(steps):
+            age = ((self.delay - step + steps - 1) // steps).clamp(min=0)
+            self.physics.ctrl.copy_(self.targets[everyone, age])
+            self.physics.step()
 
     def _push(self) -> None:
         """Change the velocity of a few robots, as a shove would."""
@@ -218,23 +239,11 @@ class A1Env(LocomotionEnv):
 
     def place(self, ids: Int[Tensor, "n"], poses: Float[Tensor, "n 3"]) -> None:
         """Put robots at rest in their stance, tilted to the ground under their feet."""
-        n = len(ids)
         feet = torch.tensor(FEET, device=self.device)
-        places = poses[:, None, :2] + rotate(feet, poses[:, 2])
-        under = self._lookup(self.peaks, places)
-        right, left = under[:, 0::2].mean(-1), under[:, 1::2].mean(-1)
-        front, rear = under[:, :2].mean(-1), under[:, 2:].mean(-1)
-        slope_x = ((front - rear) / (FEET[0][0] - FEET[2][0])).clamp(-MAX_SLOPE, MAX_SLOPE)
-        slope_y = ((left - right) / (FEET[1][1] - FEET[0][1])).clamp(-MAX_SLOPE, MAX_SLOPE)
-        # The lowest plane of this slope that keeps all four feet out of the ground.
-        rise = slope_x[:, None] * feet[:, 0] + slope_y[:, None] * feet[:, 1]
-        ground = (under - rise).amax(-1)
-        state = torch.zeros(n, self.physics.model.nq, device=self.device)
+        under = self._lookup(self.peaks, poses[:, None, :2] + rotate(feet, poses[:, 2]))
+        state = torch.zeros(len(ids), self.physics.model.nq, device=self.device)
         state[:, :2] = poses[:, :2]
-        steep = (1 + slope_x.square() + slope_y.square()).sqrt()
-        state[:, 2] = ground + steep * STANCE_HEIGHT + 0.01
-        pitch = -torch.atan(slope_x)
-        state[:, 3:7] = _quaternion(torch.atan(slope_y * torch.cos(pitch)), pitch, poses[:, 2])
+        state[:, 2], state[:, 3:7] = stand(under, poses[:, 2])
         state[:, 7:] = self.stance
         self.physics.reset(ids)
         self.physics.qpos[ids] = state.double().cpu()
@@ -243,6 +252,8 @@ class A1Env(LocomotionEnv):
         self.action_change[ids] = 0.0
         self.clock[ids] = 0.0
         self.exploded[ids] = False
+        self.targets[ids] = self.stance
+        self.senses.begin(ids)
         self._read()
 
     def _lookup(
@@ -265,10 +276,10 @@ class A1Env(LocomotionEnv):
         angle = 2 * math.pi * self.clock[:, None]
         features = torch.cat(
             (
-                self.body_velocity,
-                self.v[:, 3:6],
-                -self.up,
-                self.q[:, 7:] - self.stance,
+                self.senses.told(self.body_velocity),
+                self.v[:, 3:6] + self.senses.gyro,
+                -self.up - torch.linalg.cross(self.senses.tilt, self.up),
+                self.q[:, 7:] + self.senses.encoder - self.stance,
                 self.v[:, 6:],
                 self.last_action,
                 torch.sin(angle),
@@ -292,7 +303,8 @@ class A1Env(LocomotionEnv):
 
     def patches(self) -> Float[Tensor, "envs points"]:
         """Return the patches that `sample_patches` would; the scan shares their points."""
-        points = self.pose[:, None, :2] + rotate(self.look_points, self.pose[:, 3])
+        seen_from = self.pose[:, :2] + self.displacement + self.senses.scan[:, :2]
+        points = seen_from[:, None] + rotate(self.look_points, self.pose[:, 3])
         look = sample_heights(self.heights, points, resolution=self.resolution, origin=self.origin)
         self.look = look.reshape(-1, *LOOK_GRID.shape)
         patch = self.look[:, : A1_GRID.shape[0]].flatten(1)
@@ -306,9 +318,10 @@ class A1Env(LocomotionEnv):
         """
         rows, columns = SCAN_GRID.shape
         side = (LOOK_GRID.shape[1] - columns) // 2
-        heights = self.look[:, -rows:, side : side + columns].flatten(1) - self.pose[:, 2:3]
+        trunk = self.pose[:, 2:3] + self.senses.scan[:, 2:]
+        heights = self.look[:, -rows:, side : side + columns].flatten(1) - trunk
         if self.settings.noise:
-            heights += SCAN_NOISE * (2 * self.uniform(*heights.shape) - 1)
+            heights += self.settings.scan_noise * (2 * self.uniform(*heights.shape) - 1)
         return SCAN_SCALE * (heights.clamp(-SCAN_LIMIT, SCAN_LIMIT) + STANCE_HEIGHT)
 
     def fallen(self) -> Bool[Tensor, "envs"]:
@@ -366,21 +379,3 @@ class A1Env(LocomotionEnv):
     def _feet(self, name: str) -> Float[Tensor, "envs 4 3"]:
         """Return a group of sensors, one vector per foot."""
         return self.sensed[:, self.sensors[name]].reshape(-1, 4, 3)
-
-
-def _quaternion(
-    roll: Float[Tensor, "n"], pitch: Float[Tensor, "n"], yaw: Float[Tensor, "n"]
-) -> Float[Tensor, "n 4"]:
-    """Return (w, x, y, z) of the rotation about x, then y, then z of the world (REP-103)."""
-    (cr, cp, cy), (sr, sp, sy) = (
-        [trig(a / 2) for a in (roll, pitch, yaw)] for trig in (torch.cos, torch.sin)
-    )
-    return torch.stack(
-        (
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ),
-        dim=-1,
-    )

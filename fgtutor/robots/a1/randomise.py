@@ -1,24 +1,35 @@
-"""How an A1 is set up, and how the robots of a batch are made to differ from one another.
+"""How an A1 is set up and disturbed, and how the robots of a batch are made to differ.
 
-Reads `A1EnvConfig`; writes masses, frictions and gains into the simulations of a `Physics`.
+Reads `A1EnvConfig`; writes masses, frictions and gains into the simulations of a `Physics`. What a
+robot measures amiss is drawn per episode (`sensing`). The presets' ranges are those usual in public
+training code: unitree_rl_gym, walk-these-ways, extreme-parkour and mjlab.
 """
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from annotated_types import Interval
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fgtutor.io.validation import Ascending, Share, check_fields
+from fgtutor.io.validation import Ascending, NonNegative, Share, check_fields
+from fgtutor.robots.a1.observation import SCAN_NOISE
 from fgtutor.robots.a1.physics import Physics
 from fgtutor.robots.a1.rewards import RewardWeights
 
 Friction = Annotated[float, Interval(gt=0, le=5)]
 """A coefficient of friction."""
 Load = Annotated[float, Interval(ge=-4, le=50)]
-"""Mass added to the trunk, which weighs 4.7 kg itself, kg."""
+"""Mass added to the trunk, which weighs 6 kg itself, kg."""
+Factor = Annotated[float, Interval(gt=0, le=10)]
+"""What a property of the model is multiplied by."""
+Damping = Annotated[float, Interval(ge=0, le=20)]
+"""Passive damping, N m s / rad, or dry friction, N m, of a joint."""
+Delay = Annotated[float, Interval(ge=0, le=1)]
+"""Time from an action to its effect, s."""
+Angle = Annotated[float, Interval(ge=0, le=1)]
+"""Greatest error of an angle, rad."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,13 +64,115 @@ class A1EnvConfig:
     """Largest change of the trunk's velocity by a push, along x and y, m/s."""
     push_seconds: Annotated[float, Interval(gt=0, le=3600)] = 8.0
     """Mean time between two pushes, s."""
+    strength: Annotated[tuple[Factor, Factor], Ascending] = (1.0, 1.0)
+    """Range of the motors' strength: a factor on stiffness, damping and greatest torque."""
+    rate_gain: Annotated[tuple[Factor, Factor], Ascending] = (1.0, 1.0)
+    """Range of a factor on the joint controllers' damping (D gain) alone."""
+    joint_damping: Annotated[tuple[Damping, Damping], Ascending] = (0.0, 0.0)
+    """Range of the passive joint damping added to the model's own, N m s / rad; small values are
+    drawn more often than large ones."""
+    dry_friction: Annotated[tuple[Damping, Damping], Ascending] = (0.0, 0.0)
+    """Range of the joints' dry friction added to the model's own, N m; small ones more often."""
+    delay: Annotated[tuple[Delay, Delay], Ascending] = (0.0, 0.0)
+    """Range of the time after which a robot's actions take effect, s; whole simulation steps."""
+    noise_share: NonNegative = 1.0
+    """Sensor noise as a multiple of legged_gym's, if there is `noise`; not that of the scan."""
+    scan_noise: NonNegative = SCAN_NOISE
+    """Largest noise of each scanned height, m, if there is `noise`."""
+    velocity: Literal["true", "none", "error", "odometry"] = "true"
+    """What the `policy` group knows of the trunk's velocity: the truth and `noise`; zeros; the
+    truth and a correlated error; or what stance legs and gyroscope say, noisy as they are. A policy
+    that estimates its velocity (group `history`) never sees this."""
+    velocity_error: NonNegative = 0.2
+    """Standard deviation of the correlated error along each axis, m/s."""
+    velocity_seconds: Annotated[float, Interval(gt=0, le=3600)] = 0.5
+    """Time over which the correlated error forgets itself, s."""
+    scan_offset: NonNegative = 0.0
+    """Greatest error of an episode's scan in height, m."""
+    scan_shift: NonNegative = 0.0
+    """Greatest error of an episode's scan along x and along y of the world, m."""
+    scan_drift: NonNegative = 0.0
+    """Growth of the scan's error along each axis, m per square root of a second (random walk)."""
+    encoder_offset: Angle = 0.0
+    """Greatest error of a joint's zero in an episode, rad; the joint is controlled by it, too."""
+    tilt_offset: Angle = 0.0
+    """Greatest error of an episode's direction of gravity, in roll and in pitch, rad."""
+    gyro_offset: Angle = 0.0
+    """Greatest error of an episode's rotation rates, rad/s."""
 
     def __post_init__(self) -> None:
         check_fields(self)
 
 
-def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bool[Tensor, "sims 1"]:
-    """Make every simulation another robot on another ground; return which robots act late."""
+UNDISTURBED = A1EnvConfig(
+    noise=False,
+    friction=(0.8, 0.8),
+    payload=(0.0, 0.0),
+    centre_shift=0.0,
+    gain_share=0.0,
+    delayed_share=0.0,
+    push_speed=0.0,
+)
+"""No disturbance on any axis: `replace` one of them to see what it alone does."""
+DISTURBED = A1EnvConfig(
+    friction=(0.4, 1.1),
+    payload=(0.0, 2.0),
+    centre_shift=0.0,
+    gain_share=0.0,
+    delayed_share=0.0,
+    delay=(0.0, 0.03),
+    push_speed=0.5,
+    push_seconds=5.0,
+    velocity="odometry",
+    scan_offset=0.03,
+    scan_shift=0.03,
+)
+"""What evaluation calls disturbed."""
+WIDE = A1EnvConfig(
+    friction=(0.3, 1.25),
+    payload=(-1.0, 3.0),
+    centre_shift=0.04,
+    gain_share=0.1,
+    delayed_share=0.0,
+    strength=(0.8, 1.2),
+    rate_gain=(0.5, 2.0),
+    joint_damping=(0.0, 2.0),
+    dry_friction=(0.0, 0.3),
+    delay=(0.0, 0.04),
+    push_speed=0.7,
+    push_seconds=6.0,
+    velocity="none",
+    scan_noise=0.03,
+    scan_offset=0.05,
+    scan_shift=0.05,
+    scan_drift=0.01,
+    encoder_offset=0.02,
+    tilt_offset=0.03,
+    gyro_offset=0.05,
+)
+"""What policies that shall hold under `DISTURBED`, and on other models, are trained under."""
+
+
+class Bodies(NamedTuple):
+    """How the robots of a batch differ."""
+
+    late: Bool[Tensor, "sims 1"]
+    """Which act one control step late."""
+    delay: Int[Tensor, "sims"]
+    """After how many simulation steps each one's action takes effect."""
+    traits: Float[Tensor, "sims 7"]
+    """What only a critic may know, about -1 to 1 each, 0 for the model itself: friction, payload,
+    strength, D gain, joint damping, dry friction and delay."""
+
+    @classmethod
+    def alike(cls, n: int) -> "Bodies":
+        """Return `n` robots that do not differ."""
+        late = torch.zeros(n, 1, dtype=torch.bool)
+        return cls(late, torch.zeros(n, dtype=torch.long), torch.zeros(n, 7))
+
+
+def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bodies:
+    """Make every simulation another robot on another ground; return how they differ."""
     s, n = settings, physics.num_sims
     rng = torch.Generator().manual_seed(seed)
 
@@ -67,7 +180,8 @@ def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bool[Tensor
         return low + (high - low) * torch.rand(n, *shape, generator=rng, dtype=torch.float64)
 
     trunk, own = physics.model.body("trunk"), physics.model
-    physics.parameter("opt.o_friction")[:, :2] = draw(*s.friction, 1)
+    friction = draw(*s.friction, 1)
+    physics.parameter("opt.o_friction")[:, :2] = friction
     load = draw(*s.payload, 1) + trunk.mass.item()
     physics.parameter("body_mass")[:, trunk.id] = load[:, 0]
     inertia = torch.tensor(trunk.inertia) / trunk.mass.item()
@@ -76,9 +190,26 @@ def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bool[Tensor
     physics.parameter("body_ipos")[:, trunk.id] = centre
     # MuJoCo writes a position controller as gain[0] * ctrl + bias[1] * q + bias[2] * dq/dt.
     stiffness, damping = (draw(1 - s.gain_share, 1 + s.gain_share, 1) for _ in range(2))
+    late = draw(0.0, 1.0, 1) < s.delayed_share
+    strength, rate_gain, delay = draw(*s.strength, 1), draw(*s.rate_gain, 1), draw(*s.delay, 1)
+    passive, dry = (
+        low + (high - low) * draw(0.0, 1.0, 1).square()
+        for low, high in (s.joint_damping, s.dry_friction)
+    )
     gain, bias = physics.parameter("actuator_gainprm"), physics.parameter("actuator_biasprm")
-    gain[:, :, 0] = torch.tensor(own.actuator_gainprm[:, 0]) * stiffness
-    bias[:, :, 1] = torch.tensor(own.actuator_biasprm[:, 1]) * stiffness
-    bias[:, :, 2] = torch.tensor(own.actuator_biasprm[:, 2]) * damping
+    gain[:, :, 0] = torch.tensor(own.actuator_gainprm[:, 0]) * stiffness * strength
+    bias[:, :, 1] = torch.tensor(own.actuator_biasprm[:, 1]) * stiffness * strength
+    bias[:, :, 2] = torch.tensor(own.actuator_biasprm[:, 2]) * damping * rate_gain * strength
+    if s.strength != (1.0, 1.0):
+        limits = torch.tensor(own.actuator_forcerange) * strength[..., None]
+        physics.parameter("actuator_forcerange")[:] = limits
+    for name, added in (("dof_damping", passive), ("dof_frictionloss", dry)):
+        if added.any():
+            physics.parameter(name)[:, 6:] = torch.tensor(getattr(own, name)[6:]) + added
     physics.set_const()
-    return draw(0.0, 1.0, 1) < s.delayed_share
+    steps = (delay / own.opt.timestep).round().long()
+    differs = (friction - 0.8, load - trunk.mass.item(), strength - 1, rate_gain - 1, passive)
+    scales = (2.0, 0.3, 5.0, 1.0, 0.5)
+    traits = [value * scale for value, scale in zip(differs, scales, strict=True)]
+    traits = torch.cat((*traits, 3.0 * dry, 25.0 * delay), dim=-1).float()
+    return Bodies(late, steps[:, 0], traits)
