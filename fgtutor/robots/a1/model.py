@@ -10,7 +10,8 @@ unitreerobotics/unitree_ros on GitHub ("URDF" below), where no other source is n
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated
+from functools import partial
+from typing import Annotated, Literal
 
 import mujoco
 import numpy as np
@@ -26,7 +27,9 @@ from fgtutor.world.terrain import World
 Gain = Annotated[float, Interval(gt=0, le=1000)]
 """A stiffness or a torque."""
 Damping = Annotated[float, Interval(ge=0, le=100)]
-"""A damping or an inertia."""
+"""A damping, an inertia or a dry friction."""
+Solver = Literal["newton", "cg", "pgs"]
+"""How MuJoCo solves contacts."""
 
 LEGS = ("FR", "FL", "RR", "RL")
 """Legs in the order of every array (F front, R rear; R right, L left), as in Unitree's SDK."""
@@ -113,18 +116,37 @@ class A1Config:
     knee_armature: Damping = 0.02
     """Rotor inertia seen at the knee, behind its additional linkage, kg m^2."""
     damping: Damping = 0.01
-    """Passive joint damping, N m s / rad (URDF). Its dry friction of 0.2 N m is left out: it would
-    add 12 rows to every contact problem for less than 1 % of the torque limit."""
+    """Passive joint damping, N m s / rad (URDF)."""
+    dry_friction: Damping = 0.0
+    """Dry friction of a joint, N m. The URDF's 0.2 is left out: it would add 12 rows to every
+    contact problem for less than 1 % of the torque limit."""
     friction: Annotated[float, Interval(gt=0, le=5)] = 0.8
     """Sliding friction on any terrain (mujoco_menagerie's A1 foot). To randomise it, write
     `physics.parameter("opt.o_friction")[:, :2]`."""
     timestep: Annotated[float, Interval(ge=1e-4, le=0.05)] = 0.005
     """One simulation step, s; four make one control step at 50 Hz."""
     iterations: Annotated[int, Interval(ge=1, le=1000)] = 5
-    """Newton iterations at most; more change nothing visible, and a GPU back end needs few."""
+    """Iterations of the solver at most; more than 5 of Newton's change nothing visible, and a GPU
+    back end needs few."""
+    solver: Solver = "newton"
+    """How contacts are solved."""
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal"
+    """Shape of the friction cone."""
+    impratio: Annotated[float, Interval(ge=1, le=1000)] = 1.0
+    """How much stiffer friction is than the normal force, with an elliptic cone."""
+    integrator: Literal["implicitfast", "euler"] = "implicitfast"
+    """How velocities are integrated."""
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add the robot, its controllers and its sensors; another model of it does so its way."""
+        # One friction for every contact, kept in the options: given per geom, randomising it would
+        # copy an array as long as the terrain into every simulation at every call.
+        spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_OVERRIDE)
+        spec.option.o_friction = (self.friction, self.friction, 0.005, 0.0001, 0.0001)
+        _add_robot(spec, self)
 
 
 SENSORS = {
@@ -195,7 +217,7 @@ def build_spec(
     spec.modelname = "a1"
     spec.compiler.degree = False
     _set_options(spec, config)
-    _add_robot(spec, config)
+    config.add_to(spec)
     for box in boxes:
         add_box(spec, box)
     if heightfield is not None:
@@ -219,16 +241,13 @@ def world_spec(world: World, model: A1Config) -> mujoco.MjSpec:
 def _set_options(spec: mujoco.MjSpec, config: A1Config) -> None:
     option = spec.option
     option.timestep = config.timestep
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{config.integrator.upper()}")
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{config.cone.upper()}")
+    option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{config.solver.upper()}")
     option.iterations = config.iterations
+    option.impratio = config.impratio
     # What sleeps is not computed, and terrain always does: 2,500 boxes then cost half a step less.
     option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    # One friction for every contact, kept in the options: given per geom, randomising it would copy
-    # an array as long as the terrain into every simulation at every call.
-    option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_OVERRIDE)
-    option.o_friction = (config.friction, config.friction, 0.005, 0.0001, 0.0001)
     # Bounding volumes only serve drawing, yet cost time in every step while they are on.
     spec.visual.global_.bvactive = False
 
@@ -243,16 +262,16 @@ def _add_robot(spec: mujoco.MjSpec, config: A1Config) -> None:
     radius = height / 2
     for leg in LEGS:
         # A sphere in each corner stands for the hull: a box on a height field is expensive.
-        x, y = _side(leg)
+        x, y = side(leg)
         corner = (x * length / 2, y * (width / 2 - radius), 0.0)
         _add_collider(trunk, f"{leg}_corner", corner, radius)
     for leg in LEGS:
         _add_leg(spec, trunk, leg, config)
-    _add_sensors(spec)
+    add_sensors(spec)
 
 
 def _add_leg(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, leg: str, config: A1Config) -> None:
-    x, y = _side(leg)
+    x, y = side(leg)
     hip = trunk.add_body(name=f"{leg}_hip", pos=(x * LEG_X, y * LEG_Y, 0.0))
     thigh = hip.add_body(name=f"{leg}_thigh", pos=(0.0, y * HIP_OFFSET, 0.0))
     calf = thigh.add_body(name=f"{leg}_calf", pos=(0.0, 0.0, -THIGH_LENGTH))
@@ -262,22 +281,7 @@ def _add_leg(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, leg: str, config: A1Con
     _set_inertia(calf, mirrored(combined(CALF, FOOT), 1, y))
 
     for link, body in zip(LINKS, (hip, thigh, calf), strict=True):
-        body.add_joint(
-            name=f"{leg}_{link}",
-            type=mujoco.mjtJoint.mjJNT_HINGE,
-            axis=(1.0, 0.0, 0.0) if link == "hip" else (0.0, 1.0, 0.0),
-            range=JOINT_RANGES[link],
-            armature=config.knee_armature if link == "calf" else config.armature,
-            damping=(config.damping, 0.0, 0.0),
-        )
-        actuator = spec.add_actuator(
-            name=f"{leg}_{link}",
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            target=f"{leg}_{link}",
-            forcerange=(-config.torque_limit, config.torque_limit),
-            forcelimited=True,
-        )
-        actuator.set_to_position(kp=config.kp, kv=config.kd)
+        add_joint(spec, body, leg, link, config)
 
     # The knee's housing is about as wide as the thigh, 0.0245 x 0.034 m (URDF); the shin 0.016 m.
     _add_collider(thigh, f"{leg}_knee", (0.0, 0.0, -THIGH_LENGTH), 0.02)
@@ -286,7 +290,37 @@ def _add_leg(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, leg: str, config: A1Con
     calf.add_site(name=f"{leg}_foot", pos=(0.0, 0.0, -CALF_LENGTH))
 
 
-def _side(leg: str) -> tuple[int, int]:
+def add_joint(
+    spec: mujoco.MjSpec,
+    body: mujoco.MjsBody,
+    leg: str,
+    link: str,
+    config: A1Config,
+    damping: float | None = None,
+) -> mujoco.MjsActuator:
+    """Add a joint of a leg with its controller; `damping` (N m s / rad) is the config's if None."""
+    body.add_joint(
+        name=f"{leg}_{link}",
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=(1.0, 0.0, 0.0) if link == "hip" else (0.0, 1.0, 0.0),
+        range=JOINT_RANGES[link],
+        armature=config.knee_armature if link == "calf" else config.armature,
+        damping=(config.damping if damping is None else damping, 0.0, 0.0),
+        frictionloss=config.dry_friction,
+    )
+    actuator = spec.add_actuator(
+        name=f"{leg}_{link}",
+        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        target=f"{leg}_{link}",
+        forcerange=(-config.torque_limit, config.torque_limit),
+        forcelimited=True,
+    )
+    actuator.set_to_position(kp=config.kp, kv=config.kd)
+    return actuator
+
+
+def side(leg: str) -> tuple[int, int]:
+    """Return on which side a leg is: +1 or -1 along x (+1: front) and along y (+1: left)."""
     return (1 if leg[0] == "F" else -1), (1 if leg[1] == "L" else -1)
 
 
@@ -311,35 +345,39 @@ def _add_collider(
     )
 
 
-def _add_sensors(spec: mujoco.MjSpec) -> None:
+def add_sensors(spec: mujoco.MjSpec, *, by_calf: bool = False) -> None:
+    """Add `SENSORS` to a robot whose bodies, sites and geoms are named as this one's.
+
+    With `by_calf`, a foot's force is that of the ground on all shapes of its calf, and contacts
+    within the robot do not count: for a model that has soft feet and can touch itself.
+    """
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
+    contact = partial(_add_contact, spec, world="world" if by_calf else "")
+    site = {"objtype": objects.mjOBJ_SITE}
+    foot, name = (objects.mjOBJ_BODY, "calf") if by_calf else (objects.mjOBJ_GEOM, "foot")
     for leg in LEGS:
-        _add_contact(spec, f"{leg}_foot_force", objects.mjOBJ_GEOM, f"{leg}_foot", force=True)
+        contact(f"{leg}_foot_force", foot, f"{leg}_{name}", force=True)
     for kind, sensor in (
         ("foot_position", kinds.mjSENS_FRAMEPOS),
         ("foot_velocity", kinds.mjSENS_FRAMELINVEL),
     ):
         for leg in LEGS:
-            spec.add_sensor(
-                name=f"{leg}_{kind}",
-                type=sensor,
-                objtype=objects.mjOBJ_SITE,
-                objname=f"{leg}_foot",
-            )
+            spec.add_sensor(name=f"{leg}_{kind}", type=sensor, objname=f"{leg}_foot", **site)
     for leg in LEGS:
         for part in ("knee", "shin"):
-            _add_contact(spec, f"{leg}_{part}_contact", objects.mjOBJ_GEOM, f"{leg}_{part}")
-    _add_contact(spec, "trunk_contact", objects.mjOBJ_BODY, "trunk")
-    spec.add_sensor(
-        name="accelerometer",
-        type=kinds.mjSENS_ACCELEROMETER,
-        objtype=objects.mjOBJ_SITE,
-        objname="imu",
-    )
+            contact(f"{leg}_{part}_contact", objects.mjOBJ_GEOM, f"{leg}_{part}")
+    contact("trunk_contact", objects.mjOBJ_BODY, "trunk")
+    spec.add_sensor(name="accelerometer", type=kinds.mjSENS_ACCELEROMETER, objname="imu", **site)
 
 
 def _add_contact(
-    spec: mujoco.MjSpec, name: str, kind: mujoco.mjtObj, target: str, *, force: bool = False
+    spec: mujoco.MjSpec,
+    name: str,
+    kind: mujoco.mjtObj,
+    target: str,
+    *,
+    world: str,
+    force: bool = False,
 ) -> None:
     field = (
         mujoco.mjtConDataField.mjCONDATA_FORCE if force else mujoco.mjtConDataField.mjCONDATA_FOUND
@@ -350,6 +388,8 @@ def _add_contact(
         # The force acts on what stands here as the reference; as the object it would change sign.
         reftype=kind,
         refname=target,
+        objtype=mujoco.mjtObj.mjOBJ_BODY if world else mujoco.mjtObj.mjOBJ_UNKNOWN,
+        objname=world,
         # What to report (bits), how to reduce several contacts (3: net force, 0: none), how many.
         intprm=(1 << int(field), 3 if force else 0, 1),
     )
