@@ -46,7 +46,7 @@ def test_no_disturbance_is_the_model_as_it_is():
     walk(plain, 40)
     walk(same, 40)
     assert torch.allclose(plain.pose, same.pose, atol=1e-5)
-    assert not same.traits.any() and not same.delay.any()
+    assert not same.traits.any()
 
 
 @pytest.mark.parametrize(
@@ -82,36 +82,40 @@ def test_ranges_are_filled_and_small_dampings_are_more_frequent():
     damping = env.physics.parameter("dof_damping")[:, 8] - 0.01
     assert 0 <= damping.min() < 0.01 and 1.8 < damping.max() <= 2.0
     assert damping.median() == pytest.approx(0.5, abs=0.2)  # 2 u^2 at u = 1/2
-    assert set(env.delay.tolist()) == set(range(9))  # 0 to 40 ms in steps of 5 ms
+    delays = env.physics.parameter("actuator_delay")[:, 0] / 0.005
+    assert set(delays.round().tolist()) == set(range(9))  # 0 to 40 ms in steps of 5 ms
     assert env.traits.abs().max() < 2.5 and (env.traits.std(dim=0) > 0.1).all()
 
 
-def test_a_delayed_action_takes_effect_within_a_control_step_or_after_it():
-    """Targets in force at each simulation step, 5 ms each: delays of 0, 10, 20 and 30 ms."""
-    env = make(4, delay=(0.0, 0.03))
-    env.delay = torch.tensor([0, 2, 4, 6])
-    held = []
-    step = env.physics.step
-
-    def spy(n=1):
-        held.append(env.physics.ctrl[:, 0].clone() - STANCE[0])
-        step(n)
-
-    env.physics.step = spy
-    for value in (0.2, 0.4, 0.6):
-        env.step(torch.full((4, 12), value))
-    held = torch.stack(held).T.float()
-    for robot, late in enumerate((0, 2, 4, 6)):
-        wanted = [0.0] * late + [0.1] * 4 + [0.2] * 4 + [0.3] * 4
-        assert held[robot].tolist() == pytest.approx(wanted[:12], abs=1e-6)
+def test_a_delay_is_kept_within_a_control_step_and_beyond_it():
+    """Three simulation steps late: as if the robot had stood still for so long at first."""
+    actions = 0.5 * torch.randn(20, 1, 12, generator=torch.Generator().manual_seed(0))
+    late = make(1, substeps=1, delay=(0.015, 0.015), encoder_offset=0.01)
+    prompt = make(1, substeps=1, encoder_offset=0.01)
+    for k in range(20):
+        late.step(actions[k])
+        prompt.step(actions[k - 3] if k >= 3 else torch.zeros(1, 12))
+    assert torch.equal(late.physics.qpos, prompt.physics.qpos)
+    coarse = make(1, delay=(0.015, 0.015), encoder_offset=0.01)
+    fine = make(1, substeps=1, encoder_offset=0.01)
+    for k in range(4):
+        coarse.step(actions[k])
+        for j in range(4):
+            fine.step(actions[(4 * k + j - 3) // 4] if 4 * k + j >= 3 else torch.zeros(1, 12))
+    assert torch.equal(coarse.physics.qpos, fine.physics.qpos)
 
 
-def test_no_delay_is_one_call_of_the_simulator():
-    env = make(2)
-    calls, step = [], env.physics.step
-    env.physics.step = lambda n=1: (calls.append(n), step(n))
-    env.step(torch.zeros(2, 12))
-    assert calls == [4]
+def test_a_new_episode_forgets_the_actions_of_the_last_one():
+    env = make(2, delay=(0.04, 0.04))
+    fresh = env.physics.qpos[0].clone()
+    for _ in range(3):
+        env.step(torch.ones(2, 12))
+    env.start(torch.tensor([0]), torch.tensor([[*fresh[:2].tolist(), 0.0]]), 0.6)
+    assert torch.equal(env.physics.qpos[0], fresh)
+    env.step(torch.ones(2, 12))
+    other = make(2, delay=(0.04, 0.04))
+    other.step(torch.zeros(2, 12))
+    assert torch.allclose(env.physics.qpos[0], other.physics.qpos[0], atol=1e-6)
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ from fgtutor.robots.a1.model import (
 )
 from fgtutor.robots.a1.observation import NOISE, SCAN_GRID, SCAN_LIMIT, SCAN_SCALE
 from fgtutor.robots.a1.physics import Physics
-from fgtutor.robots.a1.randomise import A1EnvConfig, Bodies, randomise
+from fgtutor.robots.a1.randomise import A1EnvConfig, Bodies, delayable, randomise
 from fgtutor.robots.a1.sensing import Senses
 from fgtutor.robots.base import Layout, LocomotionEnv
 from fgtutor.robots.crossings import EnvConfig
@@ -103,8 +103,10 @@ class A1Env(LocomotionEnv):
         self.model = model or A1Config()
         self.control_dt = self.model.timestep * self.settings.substeps
         super().__init__(world, num_envs, config=config, seed=seed, device=device)
-        compiled = world_spec(world, self.model).compile()
-        self.physics = Physics(compiled, num_envs, threads=threads or torch.get_num_threads())
+        spec = world_spec(world, self.model)
+        if self.settings.delay[1]:
+            delayable(spec, self.settings.delay[1])
+        self.physics = Physics(spec.compile(), num_envs, threads=threads or torch.get_num_threads())
         self.sensors = sensor_slices()
         ground = np.asarray(world.elevation.filled().heights)
         around = 2 * round(RIM / self.resolution) + 1
@@ -128,9 +130,7 @@ class A1Env(LocomotionEnv):
         self.exploded = torch.zeros(num_envs, dtype=torch.bool)
         self.explosions = 0
         self.senses = Senses(self.settings, num_envs, self.control_dt, self.uniform, device)
-        remembered = math.ceil(self.settings.delay[1] / self.control_dt) + 1
-        self.targets = self.stance.expand(num_envs, remembered, 12).clone()
-        self.late, self.delay, self.traits = Bodies.alike(num_envs)
+        self.late, self.traits = Bodies.alike(num_envs)
         self.body_seed = seed
         self._randomise()
         self.reset_all()
@@ -141,7 +141,7 @@ class A1Env(LocomotionEnv):
         """Make every simulation another robot on another ground, once for all its episodes."""
         if self.settings.randomise:
             bodies = randomise(self.physics, self.settings, self.body_seed)
-            self.late, self.delay, self.traits = (value.to(self.device) for value in bodies)
+            self.late, self.traits = (value.to(self.device) for value in bodies)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what training must store to continue, and which robots it had drawn."""
@@ -168,27 +168,13 @@ class A1Env(LocomotionEnv):
         target = self.stance + self.settings.action_scale * applied
         if self.settings.randomise and self.settings.push_speed:
             self._push()
-        self._simulate(target)
+        self.physics.ctrl.copy_(target - self.senses.encoder)
+        self.physics.step(self.settings.substeps)
         self.clock = (self.clock + self.settings.gait_frequency * self.control_dt).remainder(1.0)
         self._read()
         force = self._feet("foot_force").norm(dim=-1)
         self.senses.advance(self.q[:, 7:], self.v[:, 6:], self.v[:, 3:6], self.up, force)
         self._count_explosions(broken.cpu())
-
-    def _simulate(self, target: Float[Tensor, "envs 12"]) -> None:
-        """Simulate one control step, in which each robot's target changes after its delay."""
-        target = target - self.senses.encoder
-        steps = self.settings.substeps
-        if not self.delay.any():
-            self.physics.ctrl.copy_(target)
-            self.physics.step(steps)
-            return
-        self.targets = torch.cat((target[:, None], self.targets[:, :-1]), dim=1)  # newest first
-        everyone = torch.arange(self.num_envs, device=self.device)
-        for step in range(steps):
-            age = ((self.delay - step + steps - 1) // steps).clamp(min=0)
-            self.physics.ctrl.copy_(self.targets[everyone, age])
-            self.physics.step()
 
     def _push(self) -> None:
         """Change the velocity of a few robots, as a shove would."""
@@ -252,8 +238,8 @@ class A1Env(LocomotionEnv):
         self.action_change[ids] = 0.0
         self.clock[ids] = 0.0
         self.exploded[ids] = False
-        self.targets[ids] = self.stance
         self.senses.begin(ids)
+        self.physics.hold(ids, self.stance - self.senses.encoder[ids])
         self._read()
 
     def _lookup(

@@ -59,6 +59,7 @@ class Physics:
         self.qvel: Float64[Tensor, "sims nv"] = torch.from_numpy(self._batch.bind("qvel"))
         self.ctrl: Float64[Tensor, "sims nu"] = torch.from_numpy(self._batch.bind("ctrl"))
         self.sensors: Float64[Tensor, "sims nsensordata"] = self.derived("sensordata")
+        self._history = torch.from_numpy(self._batch.bind("history"))
         self.reset()
         self.forward()
 
@@ -86,6 +87,19 @@ class Physics:
             keyframe = 0 if self.model.nkey else -1
             stage = int(mujoco.mjtStage.mjSTAGE_NONE)
             self._call(self._batch.reset, _numpy(ids), keyframe=keyframe, stage=stage)
+
+    def hold(self, ids: Int64[Tensor, " ids"], ctrl: Float64[Tensor, "ids nu"]) -> None:
+        """Let delayed actuators follow `ctrl` until newer controls arrive; call it after `reset`.
+
+        Without delays there is nothing to do.
+        """
+        if self.model.nhistory:
+            # MuJoCo keeps, for each actuator, 2 numbers, its samples' times, and their values.
+            samples = self.model.actuator_history[:, 0]
+            for k, (first, n) in enumerate(
+                zip(self.model.actuator_historyadr, samples, strict=True)
+            ):
+                self._history[ids, first + 2 + n : first + 2 + 2 * n] = ctrl[:, k : k + 1].double()
 
     def exploded(self) -> Int64[Tensor, " ids"]:
         """Return the simulations that met NaN, infinite or huge numbers since their last reset.

@@ -5,12 +5,13 @@ robot measures amiss is drawn per episode (`sensing`). The presets' ranges are t
 training code: unitree_rl_gym, walk-these-ways, extreme-parkour and mjlab.
 """
 
+import math
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from annotated_types import Interval
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fgtutor.io.validation import Ascending, NonNegative, Share, check_fields
@@ -158,8 +159,6 @@ class Bodies(NamedTuple):
 
     late: Bool[Tensor, "sims 1"]
     """Which act one control step late."""
-    delay: Int[Tensor, "sims"]
-    """After how many simulation steps each one's action takes effect."""
     traits: Float[Tensor, "sims 7"]
     """What only a critic may know, about -1 to 1 each, 0 for the model itself: friction, payload,
     strength, D gain, joint damping, dry friction and delay."""
@@ -168,7 +167,17 @@ class Bodies(NamedTuple):
     def alike(cls, n: int) -> "Bodies":
         """Return `n` robots that do not differ."""
         late = torch.zeros(n, 1, dtype=torch.bool)
-        return cls(late, torch.zeros(n, dtype=torch.long), torch.zeros(n, 7))
+        return cls(late, torch.zeros(n, 7))
+
+
+def delayable(spec: Any, longest: float) -> None:
+    """Give the actuators of an `MjSpec` a memory, so that controls may be late by up to `longest`.
+
+    MuJoCo then delays them itself, in the midst of a control step if need be.
+    """
+    for actuator in spec.actuators:
+        actuator.delay = longest
+        actuator.nsample = math.ceil(longest / spec.option.timestep) + 1
 
 
 def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bodies:
@@ -206,10 +215,12 @@ def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bodies:
     for name, added in (("dof_damping", passive), ("dof_frictionloss", dry)):
         if added.any():
             physics.parameter(name)[:, 6:] = torch.tensor(getattr(own, name)[6:]) + added
+    if own.nhistory:
+        step = own.opt.timestep
+        physics.parameter("actuator_delay")[:] = step * (delay / step).round()
     physics.set_const()
-    steps = (delay / own.opt.timestep).round().long()
     differs = (friction - 0.8, load - trunk.mass.item(), strength - 1, rate_gain - 1, passive)
     scales = (2.0, 0.3, 5.0, 1.0, 0.5)
     traits = [value * scale for value, scale in zip(differs, scales, strict=True)]
     traits = torch.cat((*traits, 3.0 * dry, 25.0 * delay), dim=-1).float()
-    return Bodies(late, steps[:, 0], traits)
+    return Bodies(late, traits)
