@@ -46,6 +46,11 @@ COMMANDS = {
         "SwitchingConfig",
         "change the policy on the way, with a robot that does not quite know where it is",
     ),
+    "evaluate turned": (
+        "evaluation.turned",
+        "TurnedConfig",
+        "cross one obstacle, turned by some angles",
+    ),
     "evaluate newcomer": (
         "evaluation.newcomer",
         "NewcomerConfig",

@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
+from time import process_time
 from typing import Any, TypedDict, TypeVar
 
 from fgtutor.baselines import AssessedMap, Planner, find_route
@@ -99,6 +100,8 @@ class Planned:
     """What it was planned on."""
     answer: Route | Refusal
     """The plan."""
+    seconds: float = 0.0
+    """Time on one core that it took, with the assessment if it was the first to ask for it, s."""
 
 
 class Outcome(TypedDict):
@@ -198,14 +201,13 @@ def plan_all(
     settings: PlanSettings,
 ) -> list[Planned]:
     """Plan over every ground with one planner."""
-    return [
-        Planned(
-            ground=ground,
-            known=known,
-            answer=find_route(planner, known, ground.terrain.start, ground.terrain.goal, settings),
-        )
-        for ground, known in zip(grounds, maps, strict=True)
-    ]
+    plans = []
+    for ground, known in zip(grounds, maps, strict=True):
+        began, ends = process_time(), (ground.terrain.start, ground.terrain.goal)
+        answer = find_route(planner, known, *ends, settings)
+        took = process_time() - began
+        plans.append(Planned(ground=ground, known=known, answer=answer, seconds=took))
+    return plans
 
 
 def drive_plans(
