@@ -10,8 +10,11 @@ from fgtutor.__main__ import main
 from fgtutor.errors import ConfigError, TerrainError
 from fgtutor.evaluation import trials, turned
 from fgtutor.evaluation.turned import TurnedConfig, run, shortest, table
+from fgtutor.robots.a1.env import DROP, RIM
+from fgtutor.robots.a1.ground import rims
 from fgtutor.world.boxes import Box, rasterise
 from fgtutor.world.obstacles import Course, TerrainScale
+from fgtutor.world.terrain import make_terrain
 from fgtutor.world.turned import OVERHANG, lay_turned, make_turned, trimmed
 from fgtutor.world.turned import turned as turn
 
@@ -209,3 +212,24 @@ def test_several_obstacles_share_one_course():
     # Along +y about (4, 5); the beam lies up to half a metre beside the middle.
     assert (begin[1], end[1]) == pytest.approx((3.5, 6.5))
     assert begin[0] == pytest.approx(end[0]) and abs(begin[0] - 4.0) <= 0.5
+
+
+@pytest.mark.parametrize("angle", [0.0, 10.0, 22.0, 30.0, 37.0, 45.0])
+def test_a_foot_drops_into_holes_and_into_no_valley_at_any_angle(angle):
+    valley, gaps = (
+        make_turned(kind, angle=angle, seed=1).elevation.heights for kind in ("valley", "gaps")
+    )
+    reach = round(RIM / 0.05)
+    # At the bottom of walls of 50 degrees it is 25 cm * tan(50) below the ground 25 cm away.
+    assert (rims(valley, reach) - valley).max() < 0.30 < DROP
+    # A slot of 15 cm is a hole all along, 0.6 m deep; the border bends it.
+    hole = (rims(gaps, reach) - gaps > DROP)[15:-15, 15:-15]
+    assert (hole == (gaps < -0.5)[15:-15, 15:-15]).all() and hole.any()
+
+
+@pytest.mark.parametrize("kind", ["gaps", "bridge", "valley", "mixed"])
+def test_square_to_the_cells_what_counts_as_a_hole_is_what_a_square_window_says(kind):
+    for seed in range(1, 8, 2):
+        ground = make_terrain(kind, robot="a1", seed=seed).elevation.heights
+        square = ndimage.grey_closing(np.pad(ground, 11, mode="edge"), 11)[11:-11, 11:-11]
+        assert ((square - ground > DROP) == (rims(ground, 5) - ground > DROP)).all()

@@ -16,13 +16,13 @@ from dataclasses import fields
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import grey_closing, maximum_filter
+from scipy.ndimage import maximum_filter
 from torch import Tensor
 
 from fgtutor.patches import PatchGrid, ground_height, rotate, sample_heights
 from fgtutor.robots.a1 import observation, rewards
 from fgtutor.robots.a1.footing import FEET, stand
-from fgtutor.robots.a1.ground import edges
+from fgtutor.robots.a1.ground import edges, rims
 from fgtutor.robots.a1.model import (
     FOOT_RADIUS,
     STANCE,
@@ -109,12 +109,9 @@ class A1Env(LocomotionEnv):
         self.physics = Physics(spec.compile(), num_envs, threads=threads or torch.get_num_threads())
         self.sensors = sensor_slices()
         ground = np.asarray(world.elevation.filled().heights)
-        around = 2 * round(RIM / self.resolution) + 1
         self.peaks = torch.as_tensor(maximum_filter(ground, 3), device=device)
         self.edges = torch.as_tensor(edges(ground), device=device)
-        # Closing, unlike a maximum, does not take the foot of a wall for the floor of a hole.
-        closed = grey_closing(np.pad(ground, around, mode="edge"), around)
-        self.rims = torch.as_tensor(closed[around:-around, around:-around], device=device)
+        self.rims = torch.as_tensor(rims(ground, round(RIM / self.resolution)), device=device)
         self.stance = torch.tensor(STANCE, device=device)
         self.look_points = LOOK_GRID.points.to(device)
         self.noise, self.scale = (

@@ -1,6 +1,6 @@
 """The ground under an A1: how it enters MuJoCo, and where it has edges that feet must clear.
 
-Reads boxes or an elevation map; adds shapes to an `MjSpec`.
+Reads boxes or an elevation map; adds shapes to an `MjSpec`, and tabulates edges and holes.
 """
 
 # MuJoCo's compiled modules carry no type information that pyright could read.
@@ -11,6 +11,7 @@ import itertools
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import grey_closing
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
@@ -74,3 +75,20 @@ def edges(ground: Float[np.ndarray, "nx ny"]) -> Float[np.ndarray, "nx ny"]:
         behind = ground - padded[1 - i : 1 - i + nx, 1 - j : 1 - j + ny]
         edge = np.maximum(edge, ahead - behind.clip(min=0.0))
     return ground + edge
+
+
+def rims(ground: Float[np.ndarray, "nx ny"], reach: int) -> Float[np.ndarray, "nx ny"]:
+    """Return the ground with holes closed that are at most 2 `reach` + 1 cells wide.
+
+    A closing, unlike a maximum, does not take the foot of a wall for the floor of a hole. A square
+    window alone would reach further along diagonals than `reach`, and close valleys that lie askew
+    deeper than others; a round one alone would close the corners of chasms. The lower of both does
+    neither.
+    """
+    offset = np.arange(-reach, reach + 1)
+    square = np.ones((len(offset), len(offset)), dtype=bool)
+    disc = np.hypot(*np.meshgrid(offset, offset)) <= reach
+    around = len(offset)
+    padded = np.pad(ground, around, mode="edge")
+    closed = [grey_closing(padded, footprint=window) for window in (square, disc)]
+    return np.minimum(*closed)[around:-around, around:-around]
