@@ -18,7 +18,7 @@ from fgtutor.fusion import fuse
 from fgtutor.planning import PAPER, as_networkx, as_switching_networkx, plan
 from fgtutor.robots.a1 import model as a1_model
 from fgtutor.robots.a1.randomise import A1EnvConfig
-from fgtutor.robots.crossings import turn_rate
+from fgtutor.robots.steering import turn_rate
 from fgtutor.statistics import calibration, spl, wilson_interval
 from fgtutor.tensorization import assess
 

@@ -17,8 +17,15 @@ from fgtutor.execution import FollowConfig, execute
 from fgtutor.learning.config import A1TrainConfig, TrainConfig
 from fgtutor.learning.training import Trainer, train
 from fgtutor.planning import plan
-from fgtutor.policies.dreamwaq import HISTORY, ContextNet, DreamWaQModel, History, mirrors
-from fgtutor.policies.symmetry import Mirror
+from fgtutor.policies.dreamwaq import (
+    HISTORY,
+    ContextNet,
+    DreamWaQModel,
+    EstimatingModel,
+    History,
+    mirrors,
+)
+from fgtutor.policies.symmetry import Mirror, SymmetricMLPModel
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.robots.a1.env import A1Env, A1EnvConfig
 from fgtutor.robots.a1.model import MIRROR, MIRROR_SIGNS
@@ -59,9 +66,30 @@ def make_policy(env, **options):
     )
 
 
-def act(policy, history):
+def act(policy, history, **seen):
     with torch.no_grad():
-        return policy(TensorDict({"history": history}, batch_size=[len(history)]))
+        return policy(TensorDict({"history": history, **seen}, batch_size=[len(history)]))
+
+
+def seeing(robot="a1", history=HISTORY, **options):
+    """Return a policy that sees, and its environment."""
+    env = make_env(robot, "flat", num_envs=1)
+    observations = env.get_observations()
+    scan, size = (observations[name].shape[-1] for name in ("scan", "policy"))
+    keep = (*env.unfelt, *env.felt, *range(size - scan, size))
+    policy = EstimatingModel(
+        observations,
+        {"actor": ["history", "scan"]},
+        "actor",
+        env.num_actions,
+        hidden_dims=[16, 8],
+        distribution_cfg={"class_name": GaussianDistribution, "std_type": "log"},
+        mirror=env.mirror and env.mirror.part(keep),
+        history=history,
+        seen=scan,
+        **options,
+    )
+    return policy, env
 
 
 # The history --------------------------------------------------------------------------------------
@@ -91,11 +119,13 @@ def test_blind_groups_exist_only_if_asked_for(robot):
     env = make_env(robot)
     plain = env_class(robot)(env.world, 3, config=replace(env.config, history=0))
     blind, usual = env.get_observations(), plain.get_observations()
-    assert set(blind.keys()) - set(usual.keys()) == {"history", "critic"}
+    assert set(blind.keys()) - set(usual.keys()) == {"history", "scan", "critic"}
     for name in usual.keys():  # noqa: SIM118, a TensorDict iterates over its batch
         assert torch.equal(usual[name], blind[name])
     assert blind["history"].shape == (3, HISTORY * len(env.felt))
-    assert blind["critic"].shape == (3, 3 + blind["policy"].shape[-1])
+    traits = env.traits.shape[-1]
+    assert blind["critic"].shape == (3, 3 + traits + blind["policy"].shape[-1])
+    assert torch.equal(blind["scan"], blind["policy"][:, -blind["scan"].shape[-1] :])
 
 
 @robots
@@ -153,7 +183,8 @@ def test_the_a1_feels_its_joints_and_its_command_but_not_its_velocity():
     yaw = env.pose[0, 3].item()
     expected = [2 * 0.5 * math.cos(yaw), -2 * 0.5 * math.sin(yaw), 0.2]
     assert after["critic"][0, :3].tolist() == pytest.approx(expected, abs=1e-3)
-    assert torch.equal(after["critic"][:, 3:], after["policy"])
+    assert torch.equal(after["critic"][:, 10:], after["policy"])
+    assert not after["critic"][:, 3:10].any()  # this body is the model itself
 
 
 def test_the_critic_knows_the_velocity_without_noise():
@@ -273,6 +304,38 @@ def test_a_mirrored_history_gets_the_mirrored_estimate_and_action():
     assert torch.equal(mirrored[:, 3:], estimate[:, 3:].roll(8, dims=-1))
 
 
+def test_a_seeing_policy_is_as_symmetric():
+    policy, env = seeing()
+    order, sign = list(env.mirror.observation_index), torch.tensor(env.mirror.observation_sign)
+    seen = torch.randn(HISTORY, 9, 185)
+    image = seen[..., order] * sign
+    x, twin = (s[..., list(env.felt)].transpose(0, 1).flatten(1) for s in (seen, image))
+    one, two = act(policy, x, scan=seen[-1, :, -135:]), act(policy, twin, scan=image[-1, :, -135:])
+    assert torch.equal(two, one[:, list(MIRROR)] * torch.tensor(MIRROR_SIGNS, dtype=torch.float))
+    assert not torch.equal(one, act(policy, x, scan=image[-1, :, -135:]))
+
+
+def test_a_policy_that_was_told_its_velocity_is_adopted():
+    policy, env = seeing()
+    told = SymmetricMLPModel(
+        env.get_observations(),
+        {"actor": ["policy"]},
+        "actor",
+        12,
+        hidden_dims=[16, 8],
+        mirror=env.mirror,
+        distribution_cfg={"class_name": GaussianDistribution, "std_type": "log"},
+    )
+    policy.adopt(told, env.felt, env.unfelt)
+    history, scan = torch.randn(7, HISTORY * 47), torch.randn(7, 135)
+    with torch.no_grad():
+        estimate = policy.context(torch.cat((history, scan), dim=-1))[:, 47:50]
+        full = torch.cat((estimate, history[:, -47:], scan), dim=-1)
+        wanted = told(TensorDict({"policy": full}, batch_size=[7]))
+    assert torch.allclose(act(policy, history, scan=scan), wanted, atol=1e-5)
+    assert wanted.abs().max() > 1e-3
+
+
 def test_what_cannot_be_built_is_refused():
     env = make_env("a1", "flat", num_envs=1)
     with pytest.raises(ConfigError, match="make it even"):
@@ -282,6 +345,20 @@ def test_what_cannot_be_built_is_refused():
 
 
 # The policy as a specialist -----------------------------------------------------------------------
+
+
+def test_a_seeing_policy_comes_back_and_exports(make_specialist, tmp_path):
+    policy, _ = seeing()
+    folder = save_specialist(make_specialist(policy=policy, robot="a1"), tmp_path / "seeing")
+    loaded = load_specialist(folder)
+    described = json.loads((folder / "specialist.json").read_text())["policy"]
+    assert described["groups"] == ["history", "scan"] and described["options"]["seen"] == 135
+    assert loaded.history == HISTORY
+    history, scan = torch.randn(4, HISTORY * 47), torch.randn(4, 135)
+    answer = act(policy, history, scan=scan)
+    assert torch.equal(act(loaded.policy, history, scan=scan), answer)
+    with torch.no_grad():
+        assert torch.equal(policy.as_onnx(False)(torch.cat((history, scan), dim=-1)), answer)
 
 
 @robots
@@ -314,7 +391,8 @@ def test_exported_modules_answer_as_the_policy_does():
 
 
 def test_the_command_line_takes_an_actor():
-    assert TrainConfig().actor == "perceptive"
+    assert TrainConfig().actor == "perceptive" and TrainConfig().disturbances == "usual"
+    assert A1TrainConfig().actor == "estimating" and A1TrainConfig().disturbances == "wide"
     assert tyro.cli(A1TrainConfig, args=["--actor", "dreamwaq"]).actor == "dreamwaq"
 
 
@@ -402,7 +480,7 @@ def test_a_resumed_run_equals_an_unbroken_one_bit_for_bit(robot, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_warm_start_keeps_policy_and_encoder_while_the_critic_warms_up(tmp_path):
+def test_a_warm_start_keeps_the_policy_while_critic_and_encoder_learn(tmp_path):
     train(tiny(tmp_path / "walk", iterations=1))
     start = tmp_path / "walk" / "specialist"
     trainer = Trainer(tiny(tmp_path / "run", start_from=start, critic_warmup=1))
@@ -411,9 +489,11 @@ def test_a_warm_start_keeps_policy_and_encoder_while_the_critic_warms_up(tmp_pat
     loaded = load_specialist(start).policy.state_dict()
     assert all(torch.equal(v, loaded[k]) for k, v in first.items())
     trainer.iterate()
-    assert all(torch.equal(v, policy.state_dict()[k]) for k, v in first.items())
-    trainer.iterate()
+    held = {k: v for k, v in first.items() if not k.startswith("context.")}
+    assert all(torch.equal(v, policy.state_dict()[k]) for k, v in held.items())
     assert not torch.equal(policy.context.encoder[0].weight, first["context.encoder.0.weight"])
+    trainer.iterate()
+    assert not torch.equal(policy.state_dict()["mlp.0.weight"], first["mlp.0.weight"])
     with pytest.raises(CheckpointError, match=r"90 numbers of \['history'\], toy with the percep"):
         Trainer(tiny(tmp_path / "other", start_from=start, actor="perceptive"))
 

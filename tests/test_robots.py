@@ -10,7 +10,8 @@ from fgtutor.errors import ConfigError
 from fgtutor.feasibility import tracking_reward
 from fgtutor.patches import sample_patches
 from fgtutor.robots import ROBOTS, env_class
-from fgtutor.robots.crossings import UNTRIED, EnvConfig, slowdown, turn_rate
+from fgtutor.robots.crossings import UNTRIED, EnvConfig
+from fgtutor.robots.steering import slowdown, turn_rate
 from fgtutor.world.terrain import World, make_terrain
 
 robots = pytest.mark.parametrize("robot", sorted(ROBOTS))

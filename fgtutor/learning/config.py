@@ -19,11 +19,13 @@ from annotated_types import Interval, MinLen
 from fgtutor.errors import ConfigError
 from fgtutor.io.validation import Count, CountOrZero, NonNegative, Seed, Share, check_fields
 from fgtutor.learning.ppo import FeasibilityPPO
-from fgtutor.policies.dreamwaq import HISTORY, DreamWaQModel
+from fgtutor.policies.dreamwaq import HISTORY, LONGER, DreamWaQModel, EstimatingModel
 from fgtutor.policies.symmetry import SymmetricMLPModel
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.world.terrain import World, make_terrain
+from fgtutor.world.obstacles import OBSTACLES
+from fgtutor.world.terrain import Terrain, World, make_terrain
+from fgtutor.world.turned import make_turned
 
 Robots = Annotated[int, Interval(ge=1, le=100_000)]
 """Robots, or steps of one: as many as memory may hold."""
@@ -41,6 +43,8 @@ Std = Annotated[float, Interval(gt=0, le=2)]
 """A standard deviation of the action noise, which stays below 2."""
 Threads = Annotated[int, Interval(ge=1, le=256)]
 """Threads of one process; torch ends the process if they are too many for the system."""
+FRAMES = {"estimating": LONGER, "dreamwaq": HISTORY}
+"""Frames that an actor remembers, if it does."""
 MINI_BATCHES = 4
 """Parts of a rollout that PPO learns from one after the other."""
 
@@ -60,11 +64,16 @@ class TrainConfig:
     """Continue from the run folder's checkpoint; with more `iterations`, beyond its end."""
     start_from: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Specialist folder whose policy to start from, such as a walker's, or a run's folder, whose
-    critic and, on the same terrain, Feasibility-Net come along (to go on where it is harder);
-    default: from nothing."""
-    actor: Literal["perceptive", "dreamwaq"] = "perceptive"
-    """What the policy observes: its body and a scan of the ground, or, blind, a few steps' history
-    from which it imagines the ground (the paper's protocol)."""
+    critic comes along (to go on where it is harder); on the same terrain, so does its
+    Feasibility-Net. An estimating policy may start from one that was told its velocity. Default:
+    from nothing."""
+    actor: Literal["perceptive", "estimating", "dreamwaq"] = "perceptive"
+    """What the policy observes: its body, its velocity and a scan of the ground; a short history
+    instead of the velocity, which it estimates, and the scan; or, blind, a history from which it
+    imagines the ground (the paper's protocol)."""
+    disturbances: Literal["usual", "wide"] = "usual"
+    """How far robots, sensors and ground differ from one another; wide, of robots that have it, for
+    policies that shall hold under disturbance and on other models."""
     hours: NonNegative = 0.0
     """Stop and save after this many hours; --resume goes on. 0 sets no limit."""
     iterations: Count = 200
@@ -95,6 +104,9 @@ class TrainConfig:
     neighbours: Share = 0.0
     """Share of terrains with other obstacles at both ends, a landing away, as on mixed terrain; for
     a kind that mixed terrain has."""
+    turned: Share = 0.0
+    """Share of terrains whose obstacle lies at any angle, as on open ground; then all terrains are
+    square."""
     planning_speed: Speed = 0.85
     """Forward speed of the command that planning pairs with every patch, m/s."""
     hidden: Widths = (128, 64)
@@ -151,6 +163,8 @@ class A1TrainConfig(TrainConfig):
 
     robot: str = "a1"
     terrain: str = "gentle"
+    actor: Literal["perceptive", "estimating", "dreamwaq"] = "estimating"
+    disturbances: Literal["usual", "wide"] = "wide"
     iterations: Count = 500
     num_envs: Robots = 640
     label_seconds: Seconds = 0.8
@@ -159,6 +173,7 @@ class A1TrainConfig(TrainConfig):
     easiest_at_last: Annotated[float, Interval(ge=0, lt=1)] | None = 0.85
     std_at_last: Std | None = 0.12
     neighbours: Share = 0.6
+    turned: Share = 0.4
     planning_speed: Speed = 0.65
     hidden: Widths = (256, 128)
     gamma: Share = 0.99
@@ -196,37 +211,51 @@ def training_world(config: TrainConfig, iteration: int = 0) -> World:
     mixed = ROBOTS[config.robot].scale.mixed
     names = mixed if config.terrain == "general" else (config.terrain,)
     levels = np.linspace(config.easiest, 1.0, config.rows) if config.rows > 1 else np.ones(1)
+    shape = config.rows, config.columns
     rng = np.random.default_rng((config.seed, iteration))
-    seeds = 2 * rng.integers(2**30, size=(config.rows, config.columns))
-    between = rng.random((config.rows, config.columns)) < config.neighbours
-    return World(
-        [
-            [
-                make_terrain(
-                    names[column % len(names)],
-                    robot=config.robot,
-                    difficulty=float(level),
-                    seed=int(seeds[row, column]),
-                    neighbours=bool(between[row, column]) and names[0] in mixed,
-                )
-                for column in range(config.columns)
-            ]
-            for row, level in enumerate(levels)
-        ]
-    )
+    seeds = 2 * rng.integers(2**30, size=shape)
+    between = rng.random(shape) < config.neighbours
+    turned = rng.random(shape) < config.turned
+    angles = rng.uniform(-180.0, 180.0, size=shape)
+    scale = ROBOTS[config.robot].scale
+    if config.turned:
+        scale = dataclasses.replace(scale, width=scale.length)
+
+    def tile(row: int, column: int) -> Terrain:
+        name, seed = names[column % len(names)], int(seeds[row, column])
+        own = {
+            "robot": config.robot,
+            "difficulty": float(levels[row]),
+            "seed": seed,
+            "scale": scale,
+        }
+        if turned[row, column] and name in OBSTACLES:
+            return make_turned(name, angle=float(angles[row, column]), **own)
+        neighbours = bool(between[row, column]) and names[0] in mixed
+        return make_terrain(name, neighbours=neighbours, **own)
+
+    return World([[tile(row, column) for column in range(shape[1])] for row in range(shape[0])])
 
 
 def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
     """Build the robots on the world in which training goes on from `iteration`."""
     make = env_class(config.robot)
+    wide, options = config.disturbances != "usual", {}
+    if wide:
+        if config.disturbances not in make.disturbances:
+            raise ConfigError(
+                f"{config.robot} knows no {config.disturbances} disturbances: leave them usual"
+            )
+        options["settings"] = make.disturbances[config.disturbances]
     return make(
         training_world(config, iteration),
         config.num_envs,
         config=dataclasses.replace(
-            make.episodes, history=HISTORY if config.actor == "dreamwaq" else 0
+            make.episodes, history=FRAMES.get(config.actor, 0), oblique=wide
         ),
         seed=config.seed,
         device=config.device,
+        **options,
     )
 
 
@@ -241,10 +270,17 @@ def runner_config(config: TrainConfig, env: LocomotionEnv) -> dict[str, Any]:
     }
     actor = network | {"distribution_cfg": noise}
     groups = {"actor": ["policy"], "critic": ["policy"]}
-    if config.actor == "dreamwaq":
-        mirror = env.mirror and env.mirror.part((*env.unfelt, *env.felt))
-        actor |= {"class_name": DreamWaQModel, "mirror": mirror, "history": HISTORY}
+    if frames := FRAMES.get(config.actor):
         groups = {"actor": ["history"], "critic": ["critic"]}
+        keep = [*env.unfelt, *env.felt]
+        actor |= {"class_name": DreamWaQModel, "history": frames}
+        if config.actor == "estimating":
+            observations = env.get_observations()
+            size, seen = (observations[group].shape[-1] for group in ("policy", "scan"))
+            keep += range(size - seen, size)
+            groups["actor"].append("scan")
+            actor |= {"class_name": EstimatingModel, "seen": seen}
+        actor["mirror"] = env.mirror and env.mirror.part(keep)
     elif env.mirror:
         actor |= {"class_name": SymmetricMLPModel, "mirror": env.mirror}
     return {

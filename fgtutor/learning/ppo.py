@@ -1,8 +1,8 @@
 """PPO that fits the Feasibility-Net to the same rollouts: two losses, no shared weight.
 
 Reads rsl_rl's rollout storage, whose `tracking` group tells what happened after every step; gives
-an algorithm that trains policy and Feasibility-Net side by side, and the context encoder of a blind
-policy.
+an algorithm that trains policy and Feasibility-Net side by side, and the context encoder of a
+policy that estimates its velocity.
 Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
 """
 
@@ -24,13 +24,13 @@ QUANTILES = (0.5, 0.9, 0.95, 0.99)
 class FeasibilityPPO(PPO):
     """rsl_rl's PPO that also fits the Feasibility-Net to each rollout before it learns from it.
 
-    The two share data and nothing else: separate networks, optimisers and losses. A blind policy's
-    context encoder is fitted in the same way, to its own loss.
+    The two share data and nothing else: separate networks, optimisers and losses. A context encoder
+    is fitted in the same way, to its own loss.
     """
 
     feasibility_updates, feasibility_batch = 24, 512
     """Updates of the Feasibility-Net per rollout, and patches per update."""
-    context_updates, context_batch = 16, 2048
+    context_updates, context_batch = 32, 2048
     """Updates of the context encoder per rollout, and steps per update."""
 
     def __init__(self, *args: Any, label_steps: int, **kwargs: Any) -> None:
@@ -62,8 +62,7 @@ class FeasibilityPPO(PPO):
         self.metrics |= self.fit_feasibility()
         samples = self.context.samples(self.storage.observations) if self.context else None
         self.metrics |= super().update()
-        # While only the critic learns, nothing of the policy may change.
-        if self.context and samples and next(self.context.parameters()).requires_grad:
+        if self.context and samples:
             self.metrics |= self.fit_context(self.context, *samples)
         return self.metrics
 

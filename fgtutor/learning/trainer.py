@@ -26,6 +26,7 @@ from fgtutor.learning.checkpoints import CHECKPOINT, foreign, read_checkpoint, w
 from fgtutor.learning.config import TrainConfig, comparable, make_training_env, runner_config
 from fgtutor.learning.distributed import leads
 from fgtutor.learning.ppo import QUANTILES, FeasibilityPPO
+from fgtutor.policies.dreamwaq import EstimatingModel
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.specialist import Specialist, load_specialist, save_specialist
 
@@ -96,14 +97,19 @@ class Trainer:
     def _start_from(self, folder: Path) -> None:
         """Take over a trained policy, all but its action noise.
 
-        From a run's folder, finished or not, its critic comes along, and on the same terrain its
-        Feasibility-Net; otherwise these are new, and the critic learns first, alone.
+        From a run's folder, finished or not, its critic comes along; otherwise that is new, and
+        learns first, alone, but for an estimator of the velocity, which learns all the while. On
+        the same terrain the Feasibility-Net comes along.
         """
         checkpoint = folder / CHECKPOINT
         run = read_checkpoint(checkpoint) if checkpoint.exists() else None
         specialist = load_specialist(folder / f"snapshots/{run['iteration']}" if run else folder)
         mine, start = self.algorithm.get_policy(), specialist.policy
-        if specialist.robot != self.config.robot or start.obs_dim != mine.obs_dim:
+        told = (
+            mine if isinstance(mine, EstimatingModel) and start.obs_groups == ["policy"] else None
+        )
+        fits = told or start.obs_dim == mine.obs_dim
+        if specialist.robot != self.config.robot or not fits:
             raise CheckpointError(
                 f"{self.config.start_from} drives {specialist.robot} on {start.obs_dim} numbers of "
                 f"{start.obs_groups}, {self.config.robot} with the {self.config.actor} actor needs "
@@ -112,18 +118,21 @@ class Trainer:
         self.samples_before = int(specialist.provenance.get("samples", 0))
         noise = {k: v for k, v in mine.state_dict().items() if k.startswith("distribution")}
         try:
-            mine.load_state_dict(start.state_dict() | noise)
-            if run:
+            if told:
+                told.adopt(start, self.env.felt, self.env.unfelt)
+            else:
+                mine.load_state_dict(start.state_dict() | noise)
+            if run and not told:
                 self.algorithm.critic.load_state_dict(run["algorithm"]["critic_state_dict"])
-                if specialist.name == self.config.terrain:
-                    self.algorithm.feasibility.load_state_dict(specialist.feasibility.state_dict())
+            if specialist.name == self.config.terrain:
+                self.algorithm.feasibility.load_state_dict(specialist.feasibility.state_dict())
         except (LookupError, RuntimeError) as error:
             raise CheckpointError(
                 f"{folder} holds networks of other sizes than these with --hidden "
                 f"{' '.join(map(str, self.config.hidden))}: give its own --hidden, or start from "
                 "another"
             ) from error
-        self.critic_warmup = 0 if run else self.config.critic_warmup
+        self.critic_warmup = 0 if run and not told else self.config.critic_warmup
 
     def iterate(self) -> dict[str, float]:
         """Collect one rollout, learn from it, and return this iteration's numbers.
@@ -132,7 +141,7 @@ class Trainer:
             DivergedError: A number is no longer finite; what was saved before is kept.
         """
         if self.config.start_from and self.iteration in (0, self.critic_warmup):
-            self.algorithm.get_policy().requires_grad_(self.iteration >= self.critic_warmup)
+            self._free_policy()
             self.algorithm.learning_rate = self.config.learning_rate
         began, done = time.monotonic(), self.iteration / self.config.iterations
         self.algorithm.entropy_coef = self.config.entropy * max(0.0, 1 - 1.25 * done)
@@ -169,6 +178,12 @@ class Trainer:
             raise self._diverged(f"{', '.join(strange)} not finite")
         self.history.append(row)
         return row
+
+    def _free_policy(self) -> None:
+        """Let the policy learn, once the critic has learned enough; its estimator always does."""
+        for name, weight in self.algorithm.get_policy().named_parameters():
+            estimates = name.startswith("context.")
+            weight.requires_grad_(estimates or self.iteration >= self.critic_warmup)
 
     def _strange_weights(self) -> str:
         """Say which network has weights that are not finite, if one has."""
@@ -293,7 +308,7 @@ class Trainer:
         for name in KEPT:
             setattr(self, name, state[name])
         self.saved = self.iteration
-        self.algorithm.get_policy().requires_grad_(self.iteration >= self.critic_warmup)
+        self._free_policy()
         self._renew(dict(own["env"]))
         self.specialist()  # raises where none could be made of it at the end
         torch.set_rng_state(own["torch_random"])
@@ -322,6 +337,7 @@ class Trainer:
                 "processes": distributed.processes(),
                 "seconds": round(self.seconds, 1),
                 "config": comparable(config),
+                "conditions": self.env.conditions(),
                 "versions": {p: version(p) for p in ("torch", "rsl-rl-lib", "pymunk", "mujoco")},
                 "curve": self.history[::every],
             },

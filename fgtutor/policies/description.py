@@ -27,13 +27,14 @@ from fgtutor.io.validation import (
     check_fields,
     parse_record,
 )
-from fgtutor.policies.dreamwaq import DreamWaQModel
+from fgtutor.policies.dreamwaq import DreamWaQModel, EstimatingModel
 from fgtutor.policies.symmetry import SymmetricMLPModel
 
 POLICIES: dict[str, type[MLPModel]] = {
     "mlp": MLPModel,
     "symmetric": SymmetricMLPModel,
     "dreamwaq": DreamWaQModel,
+    "estimating": EstimatingModel,
 }
 """Policy classes that a folder may name; `register_policy` adds one."""
 Activation = Literal["elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu"]

@@ -1,19 +1,21 @@
-"""DreamWaQ, the paper's training protocol: a blind policy that infers the terrain from its history.
+"""DreamWaQ, the paper's training protocol: a policy that infers what it cannot feel from a history.
 
-Reads the last frames of proprioception. A context encoder estimates from them the body's velocity
-and a latent that says enough about the ground to predict the next frame; the policy acts on the
-newest frame and both. The critic, needed in training only, observes everything.
+Reads the last frames of proprioception, and a scan of the ground unless the policy is blind. A
+context encoder estimates from the frames the body's velocity and a latent that says enough about
+body and ground to predict the next frame; the policy acts on the newest frame, both, and the scan.
+The critic, needed in training only, observes everything.
 Source: paper, Sec. IV; Nahrendra et al., "DreamWaQ: Learning Robust Quadrupedal Locomotion With
 Implicit Terrain Imagination via Deep Reinforcement Learning", ICRA 2023. Left out: its adaptive
 bootstrapping, which at times shows the policy the true velocity in training.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int
+from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP
 from torch import Tensor, nn
 
@@ -22,7 +24,9 @@ from fgtutor.io.validation import Width
 from fgtutor.policies.symmetry import Mirror, SymmetricMLP, SymmetricMLPModel, join
 
 HISTORY = 5
-"""Frames that the policy remembers, the newest included."""
+"""Frames that a blind policy remembers, the newest included."""
+LONGER = 10
+"""Frames that a seeing one does: the longer, the better a late or weak body can be told apart."""
 VELOCITY = 3
 """How many numbers it estimates of the robot's motion."""
 BETA = 1e-3
@@ -69,16 +73,20 @@ class ContextNet(nn.Module):
         symmetry, from `mirrors`.
         """
         super().__init__()
-        self.width, self.latent = width, latent
+        self.width, self.latent, self.remembered = width, latent, history * width
         self.encoder = SymmetricMLP(
             history * width, VELOCITY + 2 * latent, mirror, hidden_dims=hidden, activation="elu"
         )
         self.decoder = MLP(VELOCITY + latent, width, hidden[::-1], "elu")
 
-    def forward(self, history: Float[Tensor, "*batch flat"]) -> Float[Tensor, "*batch features"]:
-        """Return what the policy acts on; the latent is its mean, so that acting is repeatable."""
+    def forward(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch features"]:
+        """Return what the policy acts on; the latent is its mean, so that acting is repeatable.
+
+        What follows the history in `x` is passed on as it is.
+        """
+        history, seen = x[..., : self.remembered], x[..., self.remembered :]
         estimate = self.encoder(history)[..., : VELOCITY + self.latent]
-        return torch.cat((history[..., -self.width :], estimate), dim=-1)
+        return torch.cat((history[..., -self.width :], estimate, seen), dim=-1)
 
     def samples(self, rollout: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Return (history, true velocity, next frame) of each step not followed by a new episode.
@@ -125,6 +133,9 @@ class DreamWaQModel(SymmetricMLPModel):
     The PPO loss stops at the encoder, which has a loss and an optimiser of its own (see `ppo`).
     """
 
+    seen = 0
+    """How many of its numbers, after the history, reach the policy's layers as they are."""
+
     def __init__(
         self,
         *args: Any,
@@ -136,35 +147,36 @@ class DreamWaQModel(SymmetricMLPModel):
     ) -> None:
         """Build encoder and policy for `history` frames.
 
-        `mirror` is that of (velocity, frame) and the actions; a policy built to be filled with
-        saved weights finds it there.
+        `mirror` is that of (velocity, frame, what is seen) and the actions; a policy built to be
+        filled with saved weights finds it there.
 
         Raises:
             ConfigError: The observations are no `history` frames, or the latent cannot be halved.
         """
         self.history, self.latent = history, latent
-        seen, acted = mirrors(mirror, history, latent) if mirror else (None, None)
+        felt, acted = mirrors(mirror, history, latent, self.seen) if mirror else (None, None)
         super().__init__(*args, mirror=acted, **kwargs)
         self.options = {"history": history, "latent": latent, "context_hidden": [*context_hidden]}
         self.context = ContextNet(
-            self.obs_dim // history,
+            (self.obs_dim - self.seen) // history,
             history=history,
             latent=latent,
             hidden=tuple(context_hidden),
-            mirror=seen,
+            mirror=felt,
         )
 
     def _get_latent_dim(self) -> int:
         """Return how many numbers the policy's layers read."""
-        if self.history < 1 or self.obs_dim % self.history:
+        felt = self.obs_dim - self.seen
+        if self.history < 1 or felt < self.history or felt % self.history:
             raise ConfigError(
-                f"{self.obs_dim} observations are no {self.history} frames of one width: ask the "
+                f"{felt} observations are no {self.history} frames of one width: ask the "
                 "environment for as many frames as the policy reads"
             )
-        return self.obs_dim // self.history + VELOCITY + self.latent
+        return felt // self.history + VELOCITY + self.latent + self.seen
 
     def get_latent(self, obs: Any, masks: Any = None, hidden_state: Any = None) -> Tensor:
-        """Return newest frame, estimated velocity and latent, without a way back for gradients."""
+        """Return newest frame, estimate, latent and what is seen; no gradient goes back."""
         with torch.no_grad():
             return self.context(super().get_latent(obs, masks, hidden_state))
 
@@ -182,8 +194,39 @@ class DreamWaQModel(SymmetricMLPModel):
         return exported
 
 
-def mirrors(mirror: Mirror, history: int, latent: int) -> tuple[Mirror, Mirror]:
-    """Return the mirrors of encoder and policy, from that of (velocity, frame) and the actions.
+class EstimatingModel(DreamWaQModel):
+    """The same for a policy that is not blind: after the `history` group it reads the `scan`.
+
+    It estimates its velocity, which no sensor measures, and what its body is like (as in Ji et al.,
+    "Concurrent Training of a Control Policy and a State Estimator for Dynamic and Robust Legged
+    Locomotion", RA-L 2022).
+    """
+
+    def __init__(self, *args: Any, seen: Width, **kwargs: Any) -> None:
+        """Build encoder and policy; the last `seen` numbers of what it reads are the scan."""
+        self.seen = seen
+        super().__init__(*args, **kwargs)
+        self.options |= {"seen": seen}
+
+    @torch.no_grad()
+    def adopt(self, told: MLPModel, felt: Sequence[int], unfelt: Sequence[int]) -> None:
+        """Become a policy that was told its velocity: act as it does, on the estimate instead.
+
+        `felt` and `unfelt` say where the frame and the velocity stand in what it reads, which ends
+        in what is seen. The latent is ignored at first. Raises `RuntimeError` if shapes differ.
+        """
+        state = told.mlp.state_dict()
+        first = state["0.weight"]
+        scan = range(first.shape[1] - self.seen, first.shape[1])
+        frame = first[:, [*felt, *unfelt]], first.new_zeros(len(first), self.latent)
+        state["0.weight"] = torch.cat((*frame, first[:, list(scan)]), dim=1)
+        own = self.mlp.state_dict()
+        mirror = {name: own[name] for name in own if not name[0].isdigit()}
+        self.mlp.load_state_dict(state | mirror)
+
+
+def mirrors(mirror: Mirror, history: int, latent: int, seen: int = 0) -> tuple[Mirror, Mirror]:
+    """Return the mirrors of encoder and policy, from that of (velocity, frame, seen) and actions.
 
     The mirror image of a latent is the latent with its halves exchanged: with that and an encoder
     symmetric in itself, estimates and actions are mirrored exactly.
@@ -196,10 +239,14 @@ def mirrors(mirror: Mirror, history: int, latent: int) -> tuple[Mirror, Mirror]:
             f"a symmetric latent has two halves, got a width of {latent}: make it even"
         )
     index, sign = mirror.observation_index, mirror.observation_sign
-    velocity = (index[:VELOCITY], sign[:VELOCITY])
-    frame = ([i - VELOCITY for i in index[VELOCITY:]], sign[VELOCITY:])
+    width = len(index) - VELOCITY - seen
+
+    def part(first: int, size: int) -> tuple[list[int], Sequence[float]]:
+        return [i - first for i in index[first : first + size]], sign[first : first + size]
+
+    velocity, frame, scan = part(0, VELOCITY), part(VELOCITY, width), part(VELOCITY + width, seen)
     halves = ([*range(latent // 2, latent), *range(latent // 2)], [1.0] * latent)
     return (
         Mirror(*join([frame] * history), *join([velocity, halves, halves])),
-        Mirror(*join([frame, velocity, halves]), mirror.action_index, mirror.action_sign),
+        Mirror(*join([frame, velocity, halves, scan]), mirror.action_index, mirror.action_sign),
     )

@@ -7,8 +7,8 @@ episodes lead is the work of `crossings`. A robot adds its physics in a handful 
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,7 +24,8 @@ from fgtutor.io.validation import Count, check_arguments
 from fgtutor.patches import PatchGrid, sample_patches
 from fgtutor.policies.dreamwaq import VELOCITY, History
 from fgtutor.policies.symmetry import Mirror
-from fgtutor.robots.crossings import UNTRIED, Crossings, EnvConfig, slowdown, turn_rate
+from fgtutor.robots.crossings import UNTRIED, Crossings, EnvConfig
+from fgtutor.robots.steering import slowdown, turn_rate
 from fgtutor.world.terrain import TerrainSeed, World
 
 Layout = tuple[list[dict[str, Any]], dict[str, Any]]
@@ -45,8 +46,9 @@ class LocomotionEnv(VecEnv):
 
     The `tracking` group holds, for the step just taken, (r_v, failed, ended): r_v is 0 once a robot
     has failed, so a fall never looks feasible; leaving for the next tile's obstacle counts as a
-    failure by `UNTRIED`. With `history`, there are two more groups: `history`, the last frames of
-    what a blind robot observes, and `critic`, the true velocity and the `policy` group.
+    failure by `UNTRIED`. With `history`, there are three more groups: `history`, the last frames of
+    what a blind robot observes, `scan`, what it does not, and `critic`, the true velocity, traits
+    of the body that no sensor tells, and the `policy` group.
     """
 
     grid: PatchGrid
@@ -61,6 +63,8 @@ class LocomotionEnv(VecEnv):
     """Which numbers of the `policy` group a blind robot observes: neither velocity nor scan."""
     unfelt: tuple[int, ...] = ()
     """Which three of its numbers it has to estimate instead: its velocity."""
+    disturbances: ClassVar[Mapping[str, Any]] = {}
+    """Kinds of disturbance that training may ask for beside `usual`, and the `settings` of each."""
 
     @plain_tensors
     def __init__(
@@ -96,6 +100,8 @@ class LocomotionEnv(VecEnv):
         self.cruise = torch.zeros(num_envs, device=device)
         self.tracking = torch.zeros(num_envs, 3, device=device)
         self.return_r_v = torch.zeros(num_envs, device=device)
+        self.traits = torch.zeros(num_envs, 0, device=device)
+        """What a critic may know of each robot's body; a robot that randomises writes it."""
         self.displacement = torch.zeros(num_envs, 2, device=device)
         """Where each robot takes itself to be, minus where it is (x, y), m: its map is read there.
         Whoever drives may write it; it moves what is seen, not the physics."""
@@ -152,6 +158,10 @@ class LocomotionEnv(VecEnv):
         """Return what is `unfelt`; a robot with noisy observations returns it without noise."""
         return policy[:, list(self.unfelt)]
 
+    def conditions(self) -> dict[str, Any]:
+        """Return how the robots sense, act and are disturbed, as plain values, for provenances."""
+        return {}
+
     def layout(self) -> Layout:
         """Describe the `policy` group and the action for `fgtutor export`; here, by sizes only."""
         here = f"see {type(self).__name__} in {type(self).__module__}"
@@ -166,7 +176,8 @@ class LocomotionEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         """Return the observation groups at the robots' present state."""
         patch = self.patches()
-        policy = torch.cat((self.proprioception(), self.command, self.scan(patch)), dim=-1)
+        felt, scan = self.proprioception(), self.scan(patch)
+        policy = torch.cat((felt, self.command, scan), dim=-1)
         groups = {
             "policy": policy,
             "patch": patch,
@@ -175,7 +186,8 @@ class LocomotionEnv(VecEnv):
         }
         if self.history:
             groups["history"] = self.history.see(policy[:, list(self.felt)])
-            groups["critic"] = torch.cat((self.truth(policy), policy), dim=-1)
+            groups["scan"] = scan
+            groups["critic"] = torch.cat((self.truth(policy), self.traits, policy), dim=-1)
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     @plain_tensors

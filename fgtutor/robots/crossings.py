@@ -20,14 +20,13 @@ from torch import Tensor
 
 from fgtutor.io.validation import Ascending, NonNegative, Share, Unbounded, check_fields
 from fgtutor.patches import PatchGrid
-from fgtutor.world.terrain import World
+from fgtutor.robots.steering import LOOKAHEAD, bearing, off_by, turn_rate
+from fgtutor.world.terrain import Terrain, World
 
 Speed = Annotated[float, Interval(ge=0, le=20)]
 """A speed, m/s."""
 Time = Annotated[float, Interval(gt=0, le=3600)]
 """A part of an episode, s."""
-LOOKAHEAD = 0.45
-"""Distance to the point on its line that a robot steers for, m, in training as on a route."""
 UNTRIED = 1 / 3
 """How far back the labels become 0 before a robot enters another tile's obstacle, as a share of
 their window. Over the whole window, no policy would be feasible where one must hand over to the
@@ -77,58 +76,29 @@ class EnvConfig:
     demote_below: Share = 0.3
     """Mean r_v of a crossing below which its robot moves to an easier row; so does a failure in the
     tile's first half."""
+    oblique: bool = False
+    """Whether episodes that are no crossing go on at any heading, not only at one of 8."""
     train: bool = True
     """Draw new episodes when one ends; False leaves finished robots where they are."""
     history: Annotated[int, Interval(ge=0, le=100)] = 0
-    """Frames that a blind policy remembers; with any, there are groups `history` and `critic`."""
+    """Frames that a policy which estimates remembers; with any, there are more groups, see
+    `LocomotionEnv`."""
 
     def __post_init__(self) -> None:
         check_fields(self)
-
-
-# Steering -----------------------------------------------------------------------------------------
-
-
-def bearing(beside: Float[Tensor, "envs"]) -> Float[Tensor, "envs"]:
-    """Return by how much to head to the right of a line's direction to come back to it, rad.
-
-    `beside` is how far to the left of the line each robot is, m. It steers for the point of the
-    line that is `LOOKAHEAD` away, and never comes in at more than 45 degrees, as on a route.
-    """
-    steepest = math.sin(math.pi / 4)
-    return torch.asin((beside / LOOKAHEAD).clamp(-steepest, steepest))
-
-
-def off_by(wanted: Tensor, yaw: Tensor) -> Tensor:
-    """Return the angle from `yaw` to `wanted` the shorter way, rad in [-pi, pi)."""
-    return torch.remainder(wanted - yaw + math.pi, 2 * math.pi) - math.pi
-
-
-def slowdown(wanted: Tensor, yaw: Tensor, slowest: float) -> Tensor:
-    """Return the share of its speed at which a robot should turn to the heading wanted.
-
-    It falls with the square of the yaw error's cosine, to `slowest` from 90 degrees on: without it,
-    no bend is tighter than speed / greatest turn rate.
-    """
-    return torch.cos(wanted - yaw).clamp(min=0.0).square().clamp(min=slowest)
-
-
-def turn_rate(wanted: Tensor, yaw: Tensor, limit: float, gain: float = 3.0) -> Tensor:
-    """Return the turn rate (rad/s) that closes the yaw error the shorter way, within `limit`."""
-    return (gain * off_by(wanted, yaw)).clamp(-limit, limit)
-
-
-# Crossings ----------------------------------------------------------------------------------------
 
 
 class Crossings:
     """The way that each robot of a batch is to go, and the tile that it goes on.
 
     A terrain says where its way lies (`Terrain.lane`, `spread`, `limits`, `span`); tables hold it
-    for all tiles (rows, columns) at once, as distances from the tile's corner, m.
+    for all tiles (rows, columns) at once, as distances from the tile's corner, m. In training a way
+    may lead anywhere: its tables are those of the tile turned about its centre until it leads along
+    x (`turn`).
 
     Attributes:
         row, column: Each robot's tile; the row is its difficulty.
+        yaws: Direction in which the way of each tile leads, rad.
         crossing: Whether it is to cross the tile's obstacle; if not, it goes straight on.
         aside: How far to the left of the lane its crossing leads, m.
         target_yaw, anchor: The heading and a point (x, y) of its straight line otherwise.
@@ -154,12 +124,21 @@ class Crossings:
         self.config, self.grid, self._look, self._uniform = config, grid, look, uniform
         tiles, size = world.tiles, world.tiles[0][0].elevation.size
         x = np.arange(0.0, size[0] + LANE_STEP, LANE_STEP)
-        ends = np.array([[(tile.start[0], tile.goal[0]) for tile in row] for row in tiles])
+        self.tile_size = torch.tensor(size, dtype=torch.float32, device=device)
+        yaws = np.array([[_direction(tile) * config.train for tile in row] for row in tiles])
+        self.yaws = torch.as_tensor(yaws, dtype=torch.float32, device=device)
+        ways = [
+            [_turned(np.array(tile.lane), yaw, size) for tile, yaw in zip(row, turn, strict=True)]
+            for row, turn in zip(tiles, yaws, strict=True)
+        ]
+        ends = np.array([[(way[0, 0], way[-1, 0]) for way in row] for row in ways])
         # Where a crossing begins at the latest, if that is beyond the tile's end.
-        near = np.array([[tile.span for tile in row] for row in tiles])
+        near = np.where(yaws[..., None], ends, [[tile.span for tile in row] for row in tiles])
         near = near + config.run_up * np.array([-1.0, 1.0])
         near = np.clip(near, ends.min(-1, keepdims=True), ends.max(-1, keepdims=True))
-        lanes = [[np.interp(x, *np.array(sorted(tile.lane)).T) for tile in row] for row in tiles]
+        lanes = [
+            [np.interp(x, *way[way[:, 0].argsort(kind="stable")].T) for way in row] for row in ways
+        ]
         spreads = [[tile.spread for tile in row] for row in tiles]
         limits = [[tile.limits or (0.0, size[0]) for tile in row] for row in tiles]
         self.offsets, self.lanes, self.spreads, self.limits, self.ends, self.near = (
@@ -167,7 +146,6 @@ class Crossings:
             for table in (world.offset, lanes, spreads, limits, ends, near)
         )
         self.num_rows, self.num_columns = self.offsets.shape[:2]
-        self.tile_size = torch.tensor(size, dtype=torch.float32, device=device)
         self.everyone = torch.arange(num_envs, device=device)
         self.row = torch.zeros(num_envs, dtype=torch.long)
         self.column = torch.arange(num_envs) % self.num_columns
@@ -179,6 +157,18 @@ class Crossings:
     def corner(self, ids: Int[Tensor, "n"]) -> Float[Tensor, "n 2"]:
         """Return the world position of the corner (0, 0) of each robot's tile, m."""
         return self.offsets[self.row[ids], self.column[ids]]
+
+    def yaw(self, ids: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """Return the direction of each robot's way, rad."""
+        return self.yaws[self.row[ids], self.column[ids]]
+
+    def turn(self, ids: Int[Tensor, "n"], xy: Float[Tensor, "n 2"], yaw: Tensor) -> Tensor:
+        """Return where places in the world lie once their tiles are turned about their centres."""
+        if not yaw.any():
+            return xy
+        centre = self.corner(ids) + self.tile_size / 2
+        (x, y), cos, sin = (xy - centre).unbind(-1), torch.cos(yaw), torch.sin(yaw)
+        return centre + torch.stack((cos * x - sin * y, sin * x + cos * y), dim=-1)
 
     def _lane(self, ids: Int[Tensor, "n"], x: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         """Return how far to the left of its tile's corner each robot's lane lies at world x, m."""
@@ -208,12 +198,16 @@ class Crossings:
         beside = (self.spreads[row, column] + self.config.start_beside).clamp(max=0.3 * width)
         beside = beside * (2 * self._uniform(n) - 1)
         y = self._lane(ids, corner[:, 0] + x) + beside
-        yaw = torch.where(backwards, torch.full((n,), math.pi), torch.zeros(n))
-        across = torch.stack((corner[:, 0] + x, corner[:, 1] + y, yaw), dim=-1)
+        ahead = self.yaw(ids)
+        place = self.turn(ids, corner + torch.stack((x, y), dim=-1), ahead)
+        yaw = torch.where(backwards, math.pi, 0.0) + ahead
+        across = torch.cat((place, yaw[:, None]), dim=-1)
         inside = 0.1 + 0.8 * self._uniform(n, TRIES, 2)
         size = torch.stack((last - first, width.expand(n)), dim=-1)
         corner[:, 0] += first
-        eighths = torch.floor(self._uniform(n, TRIES) * 8)
+        eighths = self._uniform(n, TRIES) * 8
+        if not self.config.oblique:
+            eighths = torch.floor(eighths)
         anywhere = torch.cat(
             (corner[:, None] + inside * size[:, None], eighths[..., None] * (math.pi / 4)), dim=-1
         )
@@ -225,7 +219,7 @@ class Crossings:
         # Crossings begin askew towards the lane, as a route comes to it, and at large angles more
         # often than at small ones: a robot that fails to turn leaves few samples.
         share = self._uniform(n)
-        to_lane = -torch.sign(beside * torch.cos(poses[:, 2]))
+        to_lane = -torch.sign(torch.where(backwards, -beside, beside))
         askew = to_lane * ((self.config.start_yaw + SLIGHT) * share.sqrt() - SLIGHT)
         poses[:, 2] += torch.where(crossing, askew, SLIGHT * (2 * share - 1))
         return poses, crossing
@@ -243,7 +237,8 @@ class Crossings:
         """Let some robots cross their tile beside its lane, and draw which ones turn on the way."""
         self.turning[ids] = self._uniform(len(ids)) < self.config.turn_share
         self.crossing[ids] = crossing
-        beside = poses[:, 1] - self.corner(ids)[:, 1] - self._lane(ids, poses[:, 0])
+        x, y = self.turn(ids, poses[:, :2], -self.yaw(ids)).unbind(-1)
+        beside = y - self.corner(ids)[:, 1] - self._lane(ids, x)
         spread = self.spreads[self.row[ids], self.column[ids]]
         self.aside[ids] = torch.minimum(torch.maximum(beside, -spread), spread)
 
@@ -263,9 +258,10 @@ class Crossings:
             self.crossing &= ~turn
         wanted = self.target_yaw - bearing(self._beside_line(pose))
         if self.crossing.any():
-            forth = torch.sign(torch.cos(self.target_yaw))
+            yaw = self.yaw(self.everyone)
+            forth = torch.sign(torch.cos(self.target_yaw - yaw))
             beside = forth * self.beside_lane(pose, LOOKAHEAD * forth)
-            ahead = torch.where(forth > 0, 0.0, math.pi)
+            ahead = torch.where(forth > 0, 0.0, math.pi) + yaw
             wanted = torch.where(self.crossing, ahead - bearing(beside), wanted)
         expected = self.config.obedience * self.config.max_turn_rate
         self.told_yaw += dt * turn_rate(wanted, self.told_yaw, expected)
@@ -283,9 +279,10 @@ class Crossings:
     def beside_lane(
         self, pose: Float[Tensor, "envs 4"], forth: Tensor | float = 0.0
     ) -> Float[Tensor, "envs"]:
-        """Return how far in y each robot is from its way over the tile, `forth` further on, m."""
-        lane = self._lane(self.everyone, pose[:, 0] + forth) + self.aside
-        return pose[:, 1] - lane - self.corner(self.everyone)[:, 1]
+        """Return how far left of its way over the tile, `forth` further on, each robot is, m."""
+        ids = self.everyone
+        x, y = self.turn(ids, pose[:, :2], -self.yaw(ids)).unbind(-1)
+        return y - (self._lane(ids, x + forth) + self.aside) - self.corner(ids)[:, 1]
 
     def strayed(self, pose: Float[Tensor, "envs 4"]) -> Bool[Tensor, "envs"]:
         """Tell which robots are too far beside their way, or head elsewhere."""
@@ -359,3 +356,16 @@ class Crossings:
             if not (fits and ((value >= 0) & (value < number)).all()):
                 raise ValueError(f"the {name} of each robot should be one of {number}")
         self.row, self.column = state["row"].clone(), state["column"].clone()
+
+
+def _direction(tile: Terrain) -> float:
+    """Return where the way from a terrain's start to its goal leads, rad."""
+    return math.atan2(tile.goal[1] - tile.start[1], tile.goal[0] - tile.start[0])
+
+
+def _turned(way: np.ndarray, yaw: float, size: tuple[float, float]) -> np.ndarray:
+    """Return points [n, 2] of a tile turned back by `yaw` about its centre."""
+    if not yaw:
+        return way
+    centre, (cos, sin) = np.array(size) / 2, (math.cos(yaw), math.sin(yaw))
+    return (way - centre) @ np.array([[cos, -sin], [sin, cos]]) + centre

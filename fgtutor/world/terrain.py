@@ -73,7 +73,8 @@ class Terrain:
     def spread(self) -> float:
         """How far beside the lane a robot may walk, m."""
         anywhere = 0.3 * self.elevation.size[1]
-        return min((SPREAD.get(part.name, anywhere) for part in self._own), default=anywhere)
+        mine = SPREAD.get(self.name, anywhere)
+        return min((SPREAD.get(part.name, anywhere) for part in self._own), default=mine)
 
     @property
     def span(self) -> tuple[float, float]:

@@ -11,7 +11,8 @@ policy that trains on two CPU cores, adds a gait clock and left-right symmetry.
 
 import math
 import warnings
-from dataclasses import fields
+from dataclasses import asdict, fields
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ from fgtutor.robots.a1.model import (
 )
 from fgtutor.robots.a1.observation import NOISE, SCAN_GRID, SCAN_LIMIT, SCAN_SCALE
 from fgtutor.robots.a1.physics import Physics
-from fgtutor.robots.a1.randomise import A1EnvConfig, Bodies, delayable, randomise
+from fgtutor.robots.a1.randomise import WIDE, A1EnvConfig, Bodies, delayable, randomise
 from fgtutor.robots.a1.sensing import Senses
 from fgtutor.robots.base import Layout, LocomotionEnv
 from fgtutor.robots.crossings import EnvConfig
@@ -80,6 +81,7 @@ class A1Env(LocomotionEnv):
     mirror = observation.mirror()
     episodes = A1_EPISODES
     felt, unfelt = observation.FELT, observation.UNFELT
+    disturbances: ClassVar = {"wide": WIDE}
 
     def __init__(
         self,
@@ -278,6 +280,10 @@ class A1Env(LocomotionEnv):
     def truth(self, policy: Tensor) -> Float[Tensor, "envs 3"]:
         """Return the trunk's velocity in its own frame, without noise, scaled as observed."""
         return (self.body_velocity * self.scale[:3]).clamp(-20.0, 20.0)
+
+    def conditions(self) -> dict[str, Any]:
+        """Return the settings and the model, as plain values."""
+        return {"settings": asdict(self.settings), "model": asdict(self.model)}
 
     def layout(self) -> Layout:
         """Describe the observation and the action."""
