@@ -51,6 +51,11 @@ COMMANDS = {
         "TurnedConfig",
         "cross one obstacle, turned by some angles",
     ),
+    "evaluate robustness": (
+        "evaluation.robustness",
+        "RobustnessConfig",
+        "drive under one disturbance after another, and another model of the robot",
+    ),
     "evaluate newcomer": (
         "evaluation.newcomer",
         "NewcomerConfig",

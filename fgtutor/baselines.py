@@ -212,6 +212,11 @@ def single(name: str, ground: AssessedMap) -> Sequence[Layers]:
     return [ground.tensors(name)]
 
 
+def straight(name: str, ground: AssessedMap) -> Sequence[Layers]:
+    """Plan for one policy as if it could take every step: straight on, without asking it."""
+    return [{name: torch.ones(*ground.elevation.shape, NUM_HEADINGS)}]
+
+
 def ours(ground: AssessedMap) -> Sequence[Layers]:
     """Plan for all specialists, fused (the paper)."""
     return [ground.tensors()]

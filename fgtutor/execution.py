@@ -22,6 +22,7 @@ from fgtutor.errors import ConfigError
 from fgtutor.io.validation import Count, Unbounded, check_fields
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
+from fgtutor.robots.conditions import Condition
 from fgtutor.robots.crossings import LOOKAHEAD
 from fgtutor.routes import Refusal, Route
 from fgtutor.settings import PlanSettings
@@ -57,9 +58,12 @@ class FollowConfig:
     start_yaw_noise: Magnitude = 0.03
     """Standard deviation of the start yaw, rad."""
     position_noise: Magnitude = 0.0
-    """Standard deviation of each localisation fix, m; only the follower is misled by it."""
+    """Standard deviation of each localisation fix, m."""
     drift: Magnitude = 0.0
     """Growth of the localisation error, m per square root of a second (a random walk)."""
+    displaced_scan: bool = False
+    """Let the error of a fix displace what the policy sees too, as where a robot looks its heights
+    up in a map; if not, only the follower is misled."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -129,12 +133,15 @@ def execute_batch(
     *,
     seeds: Sequence[int],
     config: FollowConfig | None = None,
+    condition: Condition | None = None,
     record_body: bool = False,
     progress: bool = False,
 ) -> list[Episode]:
     """Drive route i on terrain i with the policies of `zoo`, all at once; return the episodes.
 
-    Trials on one `Terrain` stand on one tile, where they cannot meet: robots do not collide.
+    Trials on one `Terrain` stand on one tile, where they cannot meet: robots do not collide. What
+    is amiss with them, and what they are told, is the `condition`'s: nothing and all if None. What
+    it leaves to chance is drawn from the first seed.
     A route's policies are taken from `zoo` by their names; without names ("policy 0" and so on, as
     `plan` calls them then) they count in its order. Raises `ConfigError` if the lists differ in
     length, a seed is negative, the zoo is empty or mixes robots, or it lacks a policy of a route.
@@ -166,7 +173,9 @@ def execute_batch(
         history=max(specialist.history for specialist in team),
     )
     tiles = {terrain: index for index, terrain in enumerate(dict.fromkeys(terrains))}
-    env = robot(World([list(tiles)]), len(routes), config=episodes)
+    # The first seed is enough: robots of one batch are drawn one after another.
+    options = {**condition.options, "seed": seeds[0]} if condition else {}
+    env = robot(World([list(tiles)]), len(routes), config=episodes, **options)
     where = torch.tensor([tiles[terrain] for terrain in terrains])
     tracks = [_Track(route, own) for route, own in zip(routes, places, strict=True)]
     drive = _Drive(env, where, tracks, specialists, seeds, settings, speed)
@@ -292,6 +301,8 @@ class _Drive:
             believed = pose[:, :2] + self.error + config.position_noise * fixes[:, 1]
         else:
             believed = pose[:, :2]
+        if config.displaced_scan:
+            self.env.displacement[:] = torch.as_tensor(believed - pose[:, :2])
         aims = np.zeros(n)
         for i, track in enumerate(self.tracks):
             track.advance(believed[i])

@@ -94,3 +94,13 @@ def test_the_a1_s_shipped_specialists_can_be_checked():
     driven = drive(steps, "steps", CalibrationConfig(robot="a1", envs=2, seconds=1.6))
     assert len(driven.predicted) == len(driven.measured) > 20
     assert driven.measured.min() >= 0 and driven.predicted.std() > 0
+
+
+def test_a_drive_is_under_the_conditions_asked_for(make_rolling, config):
+    rolling = make_rolling("flat")
+    training, same, other = (
+        drive(rolling, "flat", replace(config, conditions=name))
+        for name in ("training", "undisturbed", "disturbed")
+    )
+    assert (training.measured == same.measured).all()  # a toy is not disturbed in training
+    assert (training.measured != other.measured).any()

@@ -11,6 +11,8 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, InfeasibleCellError
 from fgtutor.execution import FollowConfig, execute, execute_batch
 from fgtutor.planning import plan
+from fgtutor.robots import conditions_of
+from fgtutor.robots.toy import ToyEnv
 from fgtutor.world.terrain import Terrain, make_terrain
 
 
@@ -293,3 +295,38 @@ def test_a_route_that_leaps_to_the_moon_is_refused(make_rolling):
     xy[-1] = 3.8e8
     with pytest.raises(ConfigError, match="too long"):
         execute(replace(route, xy=xy), terrain, {"roll": make_rolling()})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("displaced", [False, True])
+def test_a_wrong_fix_moves_what_is_seen_if_asked(make_rolling, monkeypatch, displaced):
+    terrain = make_terrain("rubble", difficulty=0.3, seed=1)
+    route = straight(terrain.elevation, terrain.start, (4.0, terrain.start[1]))
+    errors, look = [], ToyEnv.patches
+
+    def noted(env):
+        seen, poses = look(env), env.motion()[0][:, [0, 1, 3]]
+        poses[:, :2] += env.displacement
+        assert torch.equal(seen, env.patches_at(poses))
+        errors.append(env.displacement.clone())
+        return seen
+
+    monkeypatch.setattr(ToyEnv, "patches", noted)
+    config = FollowConfig(position_noise=0.05, displaced_scan=displaced)
+    execute(route, terrain, {"roll": make_rolling()}, config=config)
+    spread = torch.cat(errors[5:]).std()
+    assert spread == (pytest.approx(0.05, rel=0.3) if displaced else 0.0)
+
+
+@pytest.mark.slow
+def test_a_condition_makes_another_robot(make_rolling):
+    route, terrain = task((1.0, 2.0), (4.5, 2.0), np.zeros((60, 40)))
+    run = {"zoo": {"roll": make_rolling()}, "seeds": [3]}
+    conditions = conditions_of("toy")
+    slippery = conditions.axes["low-friction"].levels["x 0.4"]
+    plain, same, other = (
+        execute_batch([route], [terrain], condition=condition, **run)[0]
+        for condition in (None, conditions.undisturbed, slippery)
+    )
+    assert np.array_equal(plain.poses, same.poses)
+    assert not np.array_equal(plain.poses[:20], other.poses[:20])

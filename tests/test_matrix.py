@@ -10,7 +10,7 @@ from fgtutor.errors import ConfigError, ReportError, SpecialistError, TerrainErr
 from fgtutor.evaluation import ablation, success
 from fgtutor.evaluation.ablation import AblationConfig
 from fgtutor.evaluation.cost import Cost
-from fgtutor.evaluation.matrix import MatrixConfig, policies, run, table
+from fgtutor.evaluation.matrix import MatrixConfig, forced, policies, run, table, walk_task
 from fgtutor.evaluation.shards import collect
 from fgtutor.evaluation.success import (
     make_ground,
@@ -309,3 +309,52 @@ def test_a_terrain_given_twice_is_one_line_on_the_command_line(capsys):
     words = "evaluate matrix --terrains steps steps --trials 1"
     assert main(words.split()) == 2
     assert "terrains: give each only once, 'steps' is there twice" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_policies_that_may_not_refuse_walk_straight_or_our_route(config):
+    zoo = config.load_zoo()
+    assert policies(config, zoo) == ("gaps", "steps", "ours", "general")
+    straight, along = (replace(config, walk=walk) for walk in ("straight", "ours"))
+    assert policies(straight, zoo) == ("gaps", "steps", "general")
+    walked = walk_task(straight, "flat", ("gaps", "steps"), range(2))
+    # The policy that says it can do nothing rolls as well as the other: its refusal is not asked.
+    assert [row["outcome"] for row in walked] == ["reached"] * 4
+    assert [row["policy"] for row in walked] == ["gaps", "gaps", "steps", "steps"]
+    assert [row["length"] for row in walked[:2]] == [row["length"] for row in walked[2:]]
+    assert {row["outcome"] for row in walk_task(straight, "gaps", ("gaps",), range(2))} == {"fell"}
+    led = walk_task(along, "flat", ("gaps",), range(2))
+    assert [row["outcome"] for row in led] == ["reached"] * 2
+
+
+@pytest.mark.slow
+def test_our_route_is_walked_by_one_policy_and_a_refusal_stays_one(config):
+    terrain = make_terrain("flat", seed=1)
+    grounds, zoo = [Ground(terrain=terrain, seeds=(1,))], config.load_zoo()
+    maps = [ground.assess(zoo, config.planning) for ground in grounds]
+    (plan,) = plan_all(ours, grounds, maps, config.planning)
+    alone = forced(plan, "gaps")
+    assert alone.answer.names == ("gaps",) and not alone.answer.policies.any()
+    assert (alone.answer.cells == plan.answer.cells).all() and alone.ground is plan.ground
+    (none,) = plan_all(ours, grounds, maps, PlanSettings(f_min=0.99))
+    assert forced(none, "gaps") is none
+
+
+@pytest.mark.slow
+def test_disturbed_tables_say_so_and_are_other_runs(config, capsys):
+    config = replace(config, terrains=("flat",), policies=("steps",), trials=2)
+    plain, hurt = (
+        replace(config, disturbed=flag, out=config.zoo.parent / name)
+        for flag, name in ((False, "plain"), (True, "hurt"))
+    )
+    run(plain)
+    assert "; undisturbed; told its exact velocity and the true heights" in capsys.readouterr().out
+    run(hurt)
+    assert "friction 0.8, 2 kg more" in capsys.readouterr().out
+    assert "disturbed" in (hurt.out / "table.md").read_text().splitlines()[0]
+    lengths = [[row["length"] for row in rows_in(one.out)] for one in (plain, hurt)]
+    assert lengths[0] != lengths[1]
+    stored = json.loads((hurt.out / "run.json").read_text())["settings"]["condition"]
+    assert stored["model"]["friction"] == 0.8
+    with pytest.raises(ReportError, match="condition was"):
+        run(replace(hurt, disturbed=False))

@@ -126,7 +126,7 @@ def test_as_trials_plan_and_follow(asked, ground, zoo, monkeypatch):
     name, expected = asked
     driven = []
 
-    def noted(routes, terrains, zoo, *, seeds, config):
+    def noted(routes, terrains, zoo, *, seeds, config, condition):
         driven.extend((route.to_json(), config.hold_steps) for route in routes)
         raise KeyboardInterrupt
 

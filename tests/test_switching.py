@@ -9,6 +9,7 @@ import tyro
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, ReportError, TerrainError
 from fgtutor.evaluation import switching
+from fgtutor.evaluation import trials as trials_module
 from fgtutor.evaluation.switching import (
     NEARLY_FREE,
     SwitchingConfig,
@@ -21,6 +22,7 @@ from fgtutor.evaluation.switching import (
     table,
     variants,
 )
+from fgtutor.execution import execute_batch
 from fgtutor.fusion import fuse
 from fgtutor.planning import plan
 from fgtutor.robots import ROBOTS
@@ -162,7 +164,8 @@ def test_the_command_drives_reports_and_resumes(config, capsys, monkeypatch):
     for seed in (1, 3):
         assert lengths["ours", 0.05, 0.02, seed] > lengths["ours", 0.0, 0.0, seed]
     text = (config.out / "table.md").read_text()
-    assert "| 5 + 2 | + all | 100 (34-100) | 0 | 0 | 0 | 0.0 |" in text
+    assert "| 5 + 2 | follower | + all | 100 (34-100) | 0 | 0 | 0 | 0.0 |" in text
+    assert "undisturbed; told its exact velocity and the true heights around it" in text
     assert "8 trials in all" in text and "hysteresis of 3 steps" in text
     figures = sorted(path.name for path in (config.out / "figures").iterdir())
     assert figures == ["success-0-0.svg", "success-5-2.svg"]
@@ -172,6 +175,24 @@ def test_the_command_drives_reports_and_resumes(config, capsys, monkeypatch):
     assert capsys.readouterr().out == printed[printed.index("| noise") :]
     with pytest.raises(ReportError, match="switch_cost was 1"):
         run(replace(config, switch_cost=3.0))
+
+
+@pytest.mark.slow
+def test_the_fix_misleads_the_follower_or_displaces_the_scan_too(config, monkeypatch):
+    config = replace(config, planners=("+ all",), levels=((0.05, 0.02),))
+    displaced = []
+    monkeypatch.setattr(
+        trials_module,
+        "execute_batch",
+        lambda *given, config, **rest: (
+            displaced.append(config.displaced_scan) or execute_batch(*given, config=config, **rest)
+        ),
+    )
+    rows = run_task(replace(config, misled=("follower", "scan")), "flat-flat", range(1))
+    assert [row["misled"] for row in rows] == ["follower", "scan"]
+    assert displaced == [False, True]
+    # A toy that only rolls looks at nothing: it goes the same way.
+    assert rows[0] == rows[1] | {"misled": "follower"}
 
 
 def test_planning_sees_the_scan_and_never_the_truth(config, monkeypatch):
@@ -187,13 +208,14 @@ def test_planning_sees_the_scan_and_never_the_truth(config, monkeypatch):
     assert "| 0 (0-79) | 1 | 0 | 0 | - |" in table(rows)
 
 
-def trials(course, planner, outcomes, noise=0.03, switches=2):
+def trials(course, planner, outcomes, noise=0.03, switches=2, misled="follower"):
     return [
         {
             "course": course,
             "policy": planner,
             "noise": noise,
             "drift": 0.01,
+            "misled": misled,
             "outcome": outcome,
             "switches": switches,
         }
@@ -209,17 +231,21 @@ def test_the_table_and_the_charts_by_hand(tmp_path):
         *trials("full", "general", ["no_route"] * 4),
         *trials("steps-gaps", "ours", ["reached"] * 4, noise=0.0, switches=1),
         *trials("full", "ours", ["reached"] * 4, noise=0.0, switches=1),
+        *trials("steps-gaps", "ours", ["fell"] * 2, misled="scan"),
+        *trials("full", "ours", ["reached", "fell"], misled="scan"),
     ]
     # Switches of the six successes: (2 + 2 + 4 * 5) / 6 = 4.
     assert table(rows).splitlines() == [
-        "| noise + drift | planner | steps-gaps | full | no route | fell | timeout | switches |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-        "| 3 + 1 | ours | 50 (15-85) | 100 (51-100) | 0 | 1 | 1 | 4.0 |",
-        "| 3 + 1 | general | 0 (0-49) | 0 (0-49) | 8 | 0 | 0 | - |",
-        "| 0 + 1 | ours | 100 (51-100) | 100 (51-100) | 0 | 0 | 0 | 1.0 |",
+        "| noise + drift | misled | planner | steps-gaps | full | no route | fell | timeout "
+        "| switches |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| 3 + 1 | follower | ours | 50 (15-85) | 100 (51-100) | 0 | 1 | 1 | 4.0 |",
+        "| 3 + 1 | follower | general | 0 (0-49) | 0 (0-49) | 8 | 0 | 0 | - |",
+        "| 0 + 1 | follower | ours | 100 (51-100) | 100 (51-100) | 0 | 0 | 0 | 1.0 |",
+        "| 3 + 1 | scan | ours | 0 (0-66) | 50 (9-91) | 0 | 3 | 0 | 2.0 |",
     ]
     drawn = charts(rows)
-    assert list(drawn) == ["success-3-1.svg", "success-0-1.svg"]
+    assert list(drawn) == ["success-3-1.svg", "success-0-1.svg", "scan-success-3-1.svg"]
     drawn["success-3-1.svg"](tmp_path / "chart.svg")
     drawn_words = (tmp_path / "chart.svg").read_text()  # letters are paths, words are comments
     assert all(f"<!-- {word}" in drawn_words for word in ("steps-gaps", "full", "ours", "general"))

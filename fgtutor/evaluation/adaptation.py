@@ -29,7 +29,7 @@ from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
 from fgtutor.evaluation.success import terrain_seed
 from fgtutor.evaluation.tasks import Task
-from fgtutor.evaluation.trials import Ground, Outcome, PlannedConfig, by_cell, drive
+from fgtutor.evaluation.trials import DisturbedConfig, Ground, Outcome, by_cell, drive
 from fgtutor.figures.maps import draw_plans
 from fgtutor.io.validation import Count, check_arguments
 from fgtutor.io.validation import Share as Fraction
@@ -65,7 +65,7 @@ Risers = tuple[Riser, Riser, Riser]
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptationConfig(PlannedConfig):
+class AdaptationConfig(DisturbedConfig):
     """Plan with early, mid and late checkpoints of one policy, the paper's Table I."""
 
     trials: Count = 100
@@ -209,7 +209,9 @@ def run_task(config: AdaptationConfig, index: int) -> list[AdaptationRow]:
             "straight": STRAIGHT,
             "geodesic": shortest,
         }
-        for trial in drive([ground], planners, zoo, settings=config.planning)
+        for trial in drive(
+            [ground], planners, zoo, settings=config.planning, condition=config.condition
+        )
     ]
 
 
@@ -291,13 +293,21 @@ def run(config: AdaptationConfig) -> int:
 
     def cost() -> Cost:
         detour, episodes = fmean(LENGTHS) / STRAIGHT, config.trials * len(zoo)
-        return estimate(zoo, [first], grounds=len(tasks), episodes=episodes, detour=detour)
+        return estimate(
+            zoo,
+            [first],
+            grounds=len(tasks),
+            episodes=episodes,
+            detour=detour,
+            condition=config.condition,
+        )
 
     def find(trials: list[AdaptationRow]) -> Findings:
         return Findings(
             table=table(trials, zoo),
             caption=f"{config.trials:,} trials per checkpoint on {len(tasks)} maps, with 95 % "
-            f"intervals; robot {config.robot}, {config.planning}, seed {config.seed}. SPL against "
+            f"intervals; robot {config.robot}, {config.planning}, seed {config.seed}; "
+            f"{config.told(config.condition)}. SPL against "
             f"the straight line of {STRAIGHT:g} m, as the paper's numbers imply, and against the "
             f"shortest way over no wall, {geodesic(first):.1f} m.",
             figures=figures(first, zoo, config) if config.out else {},

@@ -23,7 +23,8 @@ from fgtutor.evaluation.tasks import Task
 from fgtutor.evaluation.trials import ZooConfig
 from fgtutor.feasibility import feasibility_labels, ood_weight
 from fgtutor.io.validation import NonNegative
-from fgtutor.robots import env_class
+from fgtutor.robots import condition_of, env_class
+from fgtutor.robots.conditions import Condition
 from fgtutor.settings import SETTINGS, Taus
 from fgtutor.specialist import Specialist, load_zoo
 from fgtutor.statistics import calibration
@@ -45,8 +46,16 @@ class CalibrationConfig(ZooConfig):
     """Whose thresholds of w_ood: ours, or the paper's."""
     taus: Literal["paper", "calibrated"] | None = None
     """Other thresholds than those of the settings."""
+    conditions: Literal["training", "undisturbed", "disturbed"] = "training"
+    """What is amiss on the drive: what the environment draws in training, nothing, or the robot's
+    preset of disturbances."""
     relief: NonNegative = 0.06
     """A patch with at least this difference of heights is distinctive of its terrain, m."""
+
+    @property
+    def condition(self) -> Condition | None:
+        """What is amiss; None leaves it to the environment, as in training."""
+        return None if self.conditions == "training" else condition_of(self.robot, self.conditions)
 
     @property
     def thresholds(self) -> Taus:
@@ -96,7 +105,8 @@ def drive(specialist: Specialist, terrain: str, config: CalibrationConfig) -> Dr
     ]
     robot = env_class(config.robot)
     episodes = replace(robot.episodes, history=specialist.history)
-    env = robot(World([tiles]), config.envs, config=episodes, seed=config.seed + 1)
+    options = config.condition.options if config.condition else {}
+    env = robot(World([tiles]), config.envs, config=episodes, seed=config.seed + 1, **options)
     observations = env.get_observations()
     seen: dict[str, list[Tensor]] = {"tracking": [], "patch": [], "command": []}
     for _ in range(round(config.seconds / env.control_dt)):
@@ -164,9 +174,10 @@ def run(config: CalibrationConfig) -> int:
 
     def find(rows: list[CalibrationRow]) -> Findings:
         samples = min(row["samples"] for row in rows)
+        amiss = config.told(config.condition) if config.condition else "as amiss as in training"
         caption = (
             f"At least {samples:,} labelled patches each; robot {config.robot}, tau "
-            f"{config.thresholds}, seed {config.seed}."
+            f"{config.thresholds}, seed {config.seed}; {amiss}."
         )
         return Findings(table=table(rows), caption=caption, rows="drives")
 
@@ -179,6 +190,7 @@ def run(config: CalibrationConfig) -> int:
             COMMAND,
             without=("settings",),
             taus=config.thresholds,
+            condition=config.condition.ranges if config.condition else None,
             zoo=config.zoo_digests(),
         ),
         find=find,

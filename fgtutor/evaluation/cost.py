@@ -15,6 +15,7 @@ from fgtutor.evaluation.trials import EPISODES
 from fgtutor.execution import FollowConfig, execute_batch
 from fgtutor.io.progress import duration
 from fgtutor.planning import plan
+from fgtutor.robots.conditions import Condition
 from fgtutor.specialist import Specialist
 from fgtutor.tensorization import assess_all
 from fgtutor.world.terrain import Terrain
@@ -45,10 +46,11 @@ def estimate(
     grounds: int,
     episodes: int,
     detour: float = 1.0,
+    condition: Condition | None = None,
 ) -> Cost:
     """Measure one map and one second of driving, and work out what `grounds` and `episodes` of
     each terrain take if every trial has a route, `detour` times the straight line, and drives it
-    to the end."""
+    to the end, under the `condition`."""
     name, specialist = next(iter(zoo.items()))
     sample, at_once = terrains[0], min(episodes, EPISODES)
     threads = torch.get_num_threads()
@@ -68,6 +70,7 @@ def estimate(
             {name: specialist},
             seeds=range(at_once),
             config=FollowConfig(patience=0.0, grace=1.0),
+            condition=condition,
         )
         driven = time.perf_counter()
     finally:

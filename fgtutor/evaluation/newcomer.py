@@ -116,7 +116,9 @@ def run_task(
     rows: list[NewcomerRow] = []
     for stage, zoo in zip(stages, zoos(config), strict=True):
         digests: dict[int, dict[str, str]] = {}
-        for trial in drive(grounds, {stage: ours}, zoo, settings=config.planning):
+        for trial in drive(
+            grounds, {stage: ours}, zoo, settings=config.planning, condition=config.condition
+        ):
             row = trial.row
             if row["ground"] not in digests:
                 digests[row["ground"]] = digests_of(trial.planned.known)

@@ -17,7 +17,7 @@ from fgtutor.evaluation import report
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.report import Findings
 from fgtutor.evaluation.tasks import Row, Task
-from fgtutor.evaluation.trials import Ground, PlannedConfig, TrialRow, by_cell, drive
+from fgtutor.evaluation.trials import DisturbedConfig, Ground, TrialRow, by_cell, drive
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.statistics import Share
 from fgtutor.world.terrain import Terrain, make_terrain
@@ -34,7 +34,7 @@ Trials = Annotated[int, Interval(ge=1, le=50_000)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialsConfig(PlannedConfig):
+class TrialsConfig(DisturbedConfig):
     """What success rates are measured on."""
 
     trials: Trials | None = None
@@ -102,7 +102,8 @@ def run_task(
     zoo, grounds = config.load_zoo(), [make_ground(config, terrain, index) for index in indices]
     known = planners(zoo)
     asked = {name: known[name] for name in policies}
-    return [trial.row for trial in drive(grounds, asked, zoo, settings=config.planning)]
+    trials = drive(grounds, asked, zoo, settings=config.planning, condition=config.condition)
+    return [trial.row for trial in trials]
 
 
 def make_tasks(
@@ -158,6 +159,7 @@ def run_and_report(
             [make_ground(config, terrain, 0).terrain for terrain in terrains],
             grounds=config.grounds,
             episodes=config.count * len(policies),
+            condition=config.condition,
         )
 
     def find(trials: list[Row]) -> Findings:
@@ -166,7 +168,8 @@ def run_and_report(
             shares.setdefault(terrain, {})[policy] = Share.reached(cell)
         caption = (
             f"Success in % with 95 % intervals, {config.count:,} trials per cell; robot "
-            f"{config.robot}, protocol {config.protocol}, {config.planning}, seed {config.seed}."
+            f"{config.robot}, protocol {config.protocol}, {config.planning}, seed {config.seed}; "
+            f"{config.told(config.condition)}."
         )
         return Findings(
             table=table(trials),

@@ -11,8 +11,8 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
-from typing import Annotated, NotRequired
+from itertools import pairwise, product
+from typing import Annotated, Literal, NotRequired
 
 import numpy as np
 from annotated_types import Interval, MinLen
@@ -25,10 +25,10 @@ from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report, 
 from fgtutor.evaluation.success import cut, terrain_seed
 from fgtutor.evaluation.tasks import Task
 from fgtutor.evaluation.trials import (
+    DisturbedConfig,
     Ground,
     Outcome,
     Planned,
-    PlannedConfig,
     Trial,
     by_cell,
     choose,
@@ -63,7 +63,7 @@ change only for a step that the old and the new one can both take."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class SwitchingConfig(PlannedConfig):
+class SwitchingConfig(DisturbedConfig):
     """Drive from terrain to terrain on scanned maps, the paper's Table III."""
 
     trials: Count = 50
@@ -72,6 +72,9 @@ class SwitchingConfig(PlannedConfig):
     levels: Levels = ((0.0, 0.0), (0.03, 0.0), (0.03, 0.01), (0.06, 0.02))
     """Localisation errors: standard deviation of each fix, m, and its drift, m per square root of a
     second."""
+    misled: Annotated[tuple[Literal["follower", "scan"], ...], MinLen(1), Unique] = ("follower",)
+    """What the errors of a fix mislead: the follower alone; or the scan as well, the heights around
+    it that a policy sees, as where a robot looks them up in a map. Both: one after the other."""
     courses: Annotated[tuple[str, ...], Unique] = ()
     """Only these courses, such as steps-gaps; default: every pair of neighbours, and full."""
     planners: Annotated[tuple[str, ...], Unique] = ()
@@ -105,6 +108,8 @@ class SwitchingRow(Outcome):
     """Standard deviation of a fix, m."""
     drift: float
     """Growth of the error, m per square root of a second."""
+    misled: str
+    """What both mislead, one of `SwitchingConfig.misled`."""
     length: NotRequired[float]
     """Distance driven, m."""
     seconds: NotRequired[float]
@@ -218,11 +223,16 @@ def run_task(config: SwitchingConfig, course: str, indices: Sequence[int]) -> li
         how = planner, settings.switch_cost
         if how not in plans:
             plans[how] = plan_all(planner, grounds, maps, settings)
-        for noise, drift in config.levels:
-            follow = FollowConfig(hold_steps=settings.hold_steps, position_noise=noise, drift=drift)
+        for misled, (noise, drift) in product(config.misled, config.levels):
+            follow = FollowConfig(
+                hold_steps=settings.hold_steps,
+                position_noise=noise,
+                drift=drift,
+                displaced_scan=misled == "scan",
+            )
             rows += (
-                _row(trial, course, noise, drift)
-                for trial in drive_plans(name, plans[how], zoo, follow)
+                _row(trial, course, noise, drift, misled)
+                for trial in drive_plans(name, plans[how], zoo, follow, config.condition)
             )
     return rows
 
@@ -234,12 +244,13 @@ def make_ground(config: SwitchingConfig, kinds: Sequence[str], seed: int) -> Gro
     return Ground(terrain=terrain, seeds=(seed,), seen=scan)
 
 
-def _row(trial: Trial, course: str, noise: float, drift: float) -> SwitchingRow:
+def _row(trial: Trial, course: str, noise: float, drift: float, misled: str) -> SwitchingRow:
     row: SwitchingRow = {
         "course": course,
         "policy": trial.policy,
         "noise": noise,
         "drift": drift,
+        "misled": misled,
         "ground": trial.seed,
         "seed": trial.seed,
         "outcome": trial.outcome,
@@ -260,24 +271,38 @@ def table(trials: Sequence[SwitchingRow]) -> str:
     """
     names = list(dict.fromkeys(trial["course"] for trial in trials))
     lines = []
-    for (noise, drift, planner), own in by_cell(trials, ("noise", "drift", "policy")).items():
+    keys = ("misled", "noise", "drift", "policy")
+    for (misled, noise, drift, planner), own in by_cell(trials, keys).items():
         cells = by_cell(own, ("course",))
         shares = [Share.reached(cells[name,]) for name in names]
         level = f"{100 * noise:g} + {100 * drift:g}"
-        lines.append([level, planner, *shares, *failures(own), mean_if_reached(own, "switches")])
-    columns = ["noise + drift", "planner", *names, "no route", "fell", "timeout", "switches"]
+        lines.append(
+            [level, misled, planner, *shares, *failures(own), mean_if_reached(own, "switches")]
+        )
+    columns = [
+        "noise + drift",
+        "misled",
+        "planner",
+        *names,
+        "no route",
+        "fell",
+        "timeout",
+        "switches",
+    ]
     return markdown(columns, lines)
 
 
 def charts(trials: Sequence[SwitchingRow]) -> dict[str, Draw]:
-    """Return a chart per level: planners within courses."""
+    """Return a chart per level and what it misleads: planners within courses."""
     figures: dict[str, Draw] = {}
-    for (noise, drift), level in by_cell(trials, ("noise", "drift")).items():
+    for (misled, noise, drift), level in by_cell(trials, ("misled", "noise", "drift")).items():
         groups: dict[str, dict[str, Share]] = {}
         for (course, planner), cell in by_cell(level, ("course", "policy")).items():
             groups.setdefault(course, {})[planner] = Share.reached(cell)
         title = f"Fixes off by {100 * noise:g} cm, drift {100 * drift:g} cm per root second"
         name = f"success-{100 * noise:g}-{100 * drift:g}.svg"
+        if misled == "scan":
+            title, name = f"{title}, scan displaced", f"scan-{name}"
         figures[name] = shares_chart(groups, title)
     return figures
 
@@ -289,8 +314,10 @@ def run(config: SwitchingConfig) -> int:
 
     def cost() -> Cost:
         grounds = [lay_course(kinds, robot=config.robot) for kinds in courses(config).values()]
-        episodes = config.trials * len(planners) * len(config.levels)
-        driven = estimate(zoo, grounds, grounds=config.trials, episodes=episodes)
+        episodes = config.trials * len(planners) * len(config.levels) * len(config.misled)
+        driven = estimate(
+            zoo, grounds, grounds=config.trials, episodes=episodes, condition=config.condition
+        )
         scanned = config.trials * _scan_seconds(grounds, config.scan_spacing)
         return replace(driven, seconds=driven.seconds + scanned)
 
@@ -299,8 +326,10 @@ def run(config: SwitchingConfig) -> int:
             table=table(trials),
             caption=(
                 f"Success in % with 95 % intervals, {config.trials:,} trials per cell; fixes with "
-                "a standard deviation of noise (cm) and a drift (cm per root second), maps from a "
-                f"simulated scan; robot {config.robot}, {config.planning}, seed {config.seed}."
+                "a standard deviation of noise (cm) and a drift (cm per root second) mislead the "
+                "follower, or displace the scan that policies see as well; maps to plan on from a "
+                f"simulated scan; robot {config.robot}, {config.planning}, seed {config.seed}; "
+                f"{config.told(config.condition)}, but for the fix."
             ),
             figures=charts(trials),
         )

@@ -19,6 +19,8 @@ from fgtutor.errors import ConfigError
 from fgtutor.evaluation.shards import RunConfig, digest, settings_of
 from fgtutor.execution import Episode, FollowConfig, execute_batch
 from fgtutor.io.validation import Seed
+from fgtutor.robots import condition_of
+from fgtutor.robots.conditions import Condition
 from fgtutor.routes import Refusal, Route
 from fgtutor.settings import PlanOptions, PlanSettings
 from fgtutor.specialist import DESCRIPTION, ZOO, Specialist, load_zoo
@@ -57,6 +59,12 @@ class ZooConfig(RunConfig):
         """Return the specialists and the generalist, if there is one."""
         return load_zoo(self.robot, self.home, include_general=True)
 
+    def told(self, condition: Condition) -> str:
+        """Say what is amiss and what the policies know of their motion, for a caption."""
+        blind = all(specialist.history for specialist in self.load_zoo().values())
+        told = "its own estimate of its velocity" if blind else condition.told
+        return f"{condition.words}; told {told}"
+
     def zoo_digests(self) -> dict[str, str]:
         """Return a digest of each of them, which changes with any of its weights."""
         return {folder.name: digest((folder / DESCRIPTION).read_bytes()) for folder in self.folders}
@@ -72,6 +80,27 @@ class PlannedConfig(PlanOptions, ZooConfig):
         """Return what a command's rows depend on (see `settings_of`), the planning and the zoo."""
         everything = asdict(self.planning) | {"zoo": self.zoo_digests()} | more
         return settings_of(self, command, without=("settings", *without), **everything)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DisturbedConfig(PlannedConfig):
+    """And whether anything is amiss while they drive."""
+
+    disturbed: bool = False
+    """Drive under the robot's preset of disturbances, which the caption spells out."""
+
+    @property
+    def condition(self) -> Condition:
+        """What is amiss; raises `ConfigError` if the robot cannot be disturbed."""
+        return condition_of(self.robot, "disturbed" if self.disturbed else "undisturbed")
+
+    def run_settings(
+        self, command: str, *, without: Collection[str] = (), **more: Any
+    ) -> dict[str, Any]:
+        """Return what a command's rows depend on, every range of the disturbances with it."""
+        return super().run_settings(
+            command, without=without, condition=self.condition.ranges, **more
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -183,6 +212,7 @@ def drive(
     zoo: Mapping[str, Specialist],
     *,
     settings: PlanSettings,
+    condition: Condition | None = None,
 ) -> Iterator[Trial]:
     """Plan over every ground with every planner, and drive the routes; planner by planner.
 
@@ -191,7 +221,8 @@ def drive(
     maps = [ground.assess(zoo, settings) for ground in grounds]
     follow = FollowConfig(hold_steps=settings.hold_steps)
     for name, planner in planners.items():
-        yield from drive_plans(name, plan_all(planner, grounds, maps, settings), zoo, follow)
+        plans = plan_all(planner, grounds, maps, settings)
+        yield from drive_plans(name, plans, zoo, follow, condition)
 
 
 def plan_all(
@@ -211,7 +242,11 @@ def plan_all(
 
 
 def drive_plans(
-    policy: str, plans: Iterable[Planned], zoo: Mapping[str, Specialist], follow: FollowConfig
+    policy: str,
+    plans: Iterable[Planned],
+    zoo: Mapping[str, Specialist],
+    follow: FollowConfig,
+    condition: Condition | None = None,
 ) -> Iterator[Trial]:
     """Drive what was planned, `EPISODES` at a time; what was refused comes first."""
     jobs: dict[tuple[str, ...], list[tuple[Planned, Route, int]]] = {}
@@ -226,7 +261,9 @@ def drive_plans(
         for first in range(0, len(job), EPISODES):
             batch, routes, seeds = zip(*job[first : first + EPISODES], strict=True)
             terrains = [planned.ground.terrain for planned in batch]
-            episodes = execute_batch(routes, terrains, zoo, seeds=seeds, config=follow)
+            episodes = execute_batch(
+                routes, terrains, zoo, seeds=seeds, config=follow, condition=condition
+            )
             for planned, seed, episode in zip(batch, seeds, episodes, strict=True):
                 yield Trial(policy=policy, planned=planned, seed=seed, episode=episode)
 

@@ -7,9 +7,10 @@ never loads pymunk.
 
 import importlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from fgtutor.errors import ConfigError
+from fgtutor.robots.conditions import Condition, Conditions
 from fgtutor.world.obstacles import TerrainScale
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ class Robot:
     """What follows what on the course of `evaluate switching`; default: as in `scale.mixed`."""
     film: str | None = None
     """Module and class of its film, a `figures.episode_film.EpisodeFilm`, if it has one."""
+    conditions: str | None = None
+    """Module and name of its `Conditions`, if it can be disturbed."""
 
     @property
     def course(self) -> tuple[str, ...]:
@@ -64,6 +67,7 @@ ROBOTS = {
         ),
         order=("steps", "slopes", "steps", "gaps", "rubble", "steps"),
         film="fgtutor.figures.toy_film:ToyFilm",
+        conditions="fgtutor.robots.toy_conditions:CONDITIONS",
     ),
     "a1": Robot(
         env="fgtutor.robots.a1.env:A1Env",
@@ -71,6 +75,7 @@ ROBOTS = {
         scale=TerrainScale(),
         order=("steps", "valley", "steps", "gaps", "bridge", "steps"),  # the paper's
         film="fgtutor.figures.a1_film:A1Film",
+        conditions="fgtutor.robots.a1.conditions:CONDITIONS",
     ),
 }
 """The robots by name."""
@@ -81,6 +86,25 @@ def env_class(robot: str) -> "type[LocomotionEnv]":
     if robot not in ROBOTS:
         raise ConfigError(f"unknown robot {robot!r}; choose one of {', '.join(sorted(ROBOTS))}")
     return load(ROBOTS[robot].env)
+
+
+def conditions_of(robot: str) -> Conditions:
+    """Return what is known of a robot's disturbances; raises `ConfigError` for an unknown robot."""
+    env_class(robot)
+    place = ROBOTS[robot].conditions
+    return load(place) if place else Conditions()
+
+
+def condition_of(robot: str, name: Literal["undisturbed", "disturbed"]) -> Condition:
+    """Return one of a robot's two presets; raises `ConfigError` if it cannot be disturbed."""
+    known = getattr(conditions_of(robot), name)
+    if known is None:
+        able = [other for other in ROBOTS if conditions_of(other).disturbed]
+        raise ConfigError(
+            f"nothing is known of disturbances of {robot}; choose a robot of {', '.join(able)}, or "
+            "give its entry `conditions`"
+        )
+    return known
 
 
 def load(place: str) -> Any:
