@@ -24,6 +24,7 @@ Imports point one way, from a layer to those below it:
     fusion | tensorization | graphs | routes
     specialist
     policies | robots | feasibility          what a specialist is made of and trained on
+    tiles                                    the patches of a whole map
     patches | world                          what a policy sees; terrains
     elevation | settings
     io                                       files, progress, checks of values from outside
