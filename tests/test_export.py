@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from fgtutor.cli import export
 from fgtutor.errors import ConfigError, ExportError, SpecialistError, StorageError
 from fgtutor.patches import prepare
-from fgtutor.policies.dreamwaq import DreamWaQModel
+from fgtutor.policies.dreamwaq import DreamWaQModel, EstimatingModel
 from fgtutor.policies.symmetry import SymmetricMLPModel
 from fgtutor.robots.a1.env import A1_GRID, A1Env
 from fgtutor.specialist import Specialist, save_specialist
@@ -96,6 +96,28 @@ def test_a_blind_policy_reads_frames_without_velocity_and_scan(make_specialist, 
         None, {"observation": env.get_observations()["history"].numpy()}
     )
     np.testing.assert_allclose(action, blind.act(env.get_observations()).numpy(), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_an_estimating_policy_reads_frames_and_then_the_scan(make_specialist, tmp_path):
+    env = walk(history=4)
+    observations = env.get_observations()
+    policy = EstimatingModel(
+        observations, {"actor": ["history", "scan"]}, "actor", 12, mirror=env.mirror.part(
+            (*env.unfelt, *env.felt, *range(50, 185))), history=4, seen=135, **options(env)
+    )  # fmt: skip
+    net = make_specialist(grid=A1_GRID).feasibility
+    mine = make_specialist(robot="a1", policy=policy, grid=A1_GRID, feasibility=net)
+    assert export.export_policy(mine, tmp_path / "mine.onnx") < 1e-5
+    told = json.loads((tmp_path / "mine.json").read_text())["observation"]
+    assert "velocity" not in {part["name"] for part in told["parts"]}
+    assert [part["name"] for part in told["after the frames"]] == ["scan"]
+    assert (told["frames"], told["size"]) == (4, 4 * 47 + 135)
+    read = torch.cat((observations["history"], observations["scan"]), dim=-1)
+    (action,) = ReferenceEvaluator(str(tmp_path / "mine.onnx")).run(
+        None, {"observation": read.numpy()}
+    )
+    np.testing.assert_allclose(action, mine.act(observations).numpy(), atol=1e-5)
 
 
 def test_an_observation_can_be_built_from_the_description_alone(seeing):

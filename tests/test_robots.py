@@ -13,6 +13,7 @@ from fgtutor.robots import ROBOTS, env_class
 from fgtutor.robots.crossings import UNTRIED, EnvConfig
 from fgtutor.robots.steering import slowdown, turn_rate
 from fgtutor.world.terrain import World, make_terrain
+from fgtutor.world.turned import make_turned
 
 robots = pytest.mark.parametrize("robot", sorted(ROBOTS))
 
@@ -278,6 +279,38 @@ def test_a_crossing_is_steered_along_the_lane_at_its_distance(robot):
     assert off[0] > 0.1 and abs(off[1]) < 0.02 and off[2] < -0.1
     env.crossings.aside[:] = 0.1
     assert abs(env.crossings.headings(pose, env.control_dt)[2] - pose[2, 3]) < 0.02
+
+
+@pytest.mark.parametrize("angle", [30.0, -140.0])
+def test_a_way_that_lies_askew_is_crossed_along_it(angle):
+    """Distances to the beam and angles to it, worked out anew from the terrain's own lane."""
+    terrain = make_turned("bridge", robot="a1", angle=angle, seed=4)
+    config = EnvConfig(start_yaw=0.0, start_beside=0.0, traverse_share=1.0, episode_seconds=20.0)
+    env = env_class("a1")(World([[terrain]]), 64, config=config)
+    pose, corner = env.motion()[0], env.crossings.corner(torch.arange(1))[0]
+    a, b = (torch.tensor(point) for point in terrain.lane[1:3])
+    along = (b - a) / (b - a).norm()
+    left = torch.stack((-along[1], along[0]))
+    start = pose[:, :2] - corner
+    ends = torch.tensor([terrain.start, terrain.goal])
+    assert (torch.cdist(start, ends).amin(dim=1) < terrain.spread + 0.03).all()
+    heading = torch.stack((torch.cos(pose[:, 3]), torch.sin(pose[:, 3])), dim=-1)
+    forth = torch.sign(heading @ along)
+    assert 0.1 < (forth < 0).float().mean() < 0.6
+    assert ((heading @ along).abs() > math.cos(0.16)).all()  # `SLIGHT` askew
+    # Whoever is beside the way on the beam is steered back to it, at equal distances alike.
+    ids = torch.arange(3)
+    side = torch.tensor([0.1, 0.0, -0.1])
+    places = corner + (a + b) / 2 + side[:, None] * left
+    yaw = math.atan2(along[1], along[0])
+    env.start(ids, torch.cat((places, torch.full((3, 1), yaw)), dim=-1), 0.5)
+    env.crossings.crossing[ids], env.crossings.aside[ids] = True, 0.0
+    assert env.crossings.beside_lane(env.motion()[0])[ids].tolist() == pytest.approx(
+        side.tolist(), abs=0.01
+    )
+    off = (env.crossings.headings(env.motion()[0], env.control_dt) - yaw)[ids]
+    assert off.tolist() == pytest.approx([-0.224, 0.0, 0.224], abs=0.03)  # asin(0.1 / 0.45)
+    assert not env.crossings.outside(env.motion()[0])[0].any()
 
 
 def test_an_unknown_robot_lists_the_known_ones():

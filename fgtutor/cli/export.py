@@ -149,10 +149,11 @@ def describe(specialist: Specialist) -> dict[str, Any]:
     ground = make_terrain("flat", robot=specialist.robot)
     env = env_class(specialist.robot)(World([[ground]]), 1)
     parts, action = env.layout()
-    frames = max(1, specialist.history)
+    seen, frames = [], max(1, specialist.history)
     if specialist.history:
+        seen = parts[-1:] if "scan" in specialist.policy.obs_groups else []
         parts = _felt(parts, env.felt)
-    size = frames * sum(part["size"] for part in parts)
+    size = frames * sum(part["size"] for part in parts) + sum(part["size"] for part in seen)
     reads = specialist.policy.obs_dim
     answers = _answer(specialist.policy, torch.zeros(1, reads)).shape[-1]
     if (size, action["size"]) != (reads, answers):
@@ -175,13 +176,14 @@ def describe(specialist: Specialist) -> dict[str, Any]:
             "order of frames": "oldest first, zeros before the start",
             "formula": FORMULA,
             "parts": parts,
+            "after the frames": seen,
         },
         "action": {"name": "action", **action},
     }
 
 
 def _felt(parts: list[dict[str, Any]], felt: tuple[int, ...]) -> list[dict[str, Any]]:
-    """Return the parts that a blind policy reads: those of which it feels every number."""
+    """Return the parts of which every number is felt, and which policies that estimate remember."""
     ends = np.cumsum([part["size"] for part in parts])
     return [
         part

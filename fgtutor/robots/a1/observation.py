@@ -35,9 +35,9 @@ NOISE = {
 """What the policy feels, in order: how many numbers, largest noise in their own unit (m/s, rad/s,
 g, rad, rad/s), and the scale the policy sees them at. Noise and scales as in legged_gym."""
 UNFELT = (0, 1, 2)
-"""What no sensor of the A1 measures: its velocity. A blind policy has to estimate it."""
+"""What no sensor of the A1 measures: its velocity. It has to be estimated."""
 FELT = tuple(range(3, 3 + sum(count for count, *_ in NOISE.values())))
-"""What a blind policy observes: the rest of what the policy feels, and the command."""
+"""What a policy that estimates it remembers instead: the rest of what is felt, and the command."""
 SCAN_NOISE, SCAN_SCALE = 0.02, 3.0
 """Largest noise of a scanned height, m, and the scale the policy sees heights at."""
 
@@ -75,7 +75,8 @@ def layout(config: A1Config, action_scale: float, gait: float) -> Layout:
         gait: Gait cycles per second.
     """
     meaning = {
-        "velocity": "the trunk's velocity in its own frame (x ahead, y left, z up), m/s",
+        "velocity": "the trunk's velocity in its own frame (x ahead, y left, z up), m/s; no sensor "
+        "of the A1 measures it: it has to be estimated",
         "gyroscope": "the trunk's rotation rate in its own frame, rad/s",
         "gravity": "the direction of gravity in the trunk's frame, a unit vector",
         "joints": "angles, rad, in the order of action.joints",
