@@ -1,5 +1,7 @@
 """Menagerie's A1: what its file publishes is what is simulated, and our environment drives it."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import torch
 from fgtutor.robots.a1 import model as a1_model
 from fgtutor.robots.a1.env import A1Env, A1EnvConfig
 from fgtutor.robots.a1.menagerie import MenagerieConfig
+from fgtutor.robots.a1.randomise import UNDISTURBED
 from fgtutor.world.terrain import World, make_terrain
 
 SLICES = a1_model.sensor_slices()
@@ -112,3 +115,14 @@ def test_our_environment_drives_it():
     for _ in range(10):
         observations, *_ = env.step(torch.zeros(2, 12))
     assert torch.isfinite(observations["policy"]).all() and not env.fallen().any()
+
+
+def test_its_feet_get_the_friction_that_is_drawn():
+    terrain = make_terrain("flat", robot="a1")
+    settings = replace(UNDISTURBED, substeps=10, friction=(0.3, 0.3))
+    env = A1Env(World([[terrain]]), 2, settings=settings, model=MenagerieConfig())
+    friction = env.physics.parameter("geom_friction")
+    for leg in a1_model.LEGS:
+        foot = env.physics.model.geom(f"{leg}_foot").id
+        assert friction[:, foot].tolist() == [[0.3, 0.02, 0.01]] * 2
+    assert friction[:, env.physics.model.geom("RL_shin").id, 0].tolist() == [0.6] * 2

@@ -186,6 +186,11 @@ TOGETHER = Axis(
         "Menagerie, joint damping 0.01, noise, 20 ms, pushes": condition(
             replace(AS_SHIPPED, **ROUGH), FREE_JOINTS, "Menagerie's A1 with joint damping 0.01"
         ),
+        "Menagerie, joint damping 0.01, disturbed": condition(
+            replace(DISTURBED, substeps=AS_SHIPPED.substeps),
+            FREE_JOINTS,
+            "Menagerie's A1 with joint damping 0.01",
+        ),
         "Menagerie, joint damping 0.01, odometry": condition(
             replace(AS_SHIPPED, velocity="odometry"),
             FREE_JOINTS,

@@ -5,16 +5,21 @@ robot measures amiss is drawn per episode (`sensing`). The presets' ranges are t
 training code: unitree_rl_gym, walk-these-ways, extreme-parkour and mjlab.
 """
 
+# MuJoCo's compiled modules carry no type information that pyright could read.
+# pyright: reportAttributeAccessIssue=false
+
 import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, NamedTuple
 
+import mujoco
 import torch
 from annotated_types import Interval
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fgtutor.io.validation import Ascending, NonNegative, Share, check_fields
+from fgtutor.robots.a1.model import LEGS
 from fgtutor.robots.a1.observation import SCAN_NOISE
 from fgtutor.robots.a1.physics import Physics
 from fgtutor.robots.a1.rewards import RewardWeights
@@ -190,7 +195,7 @@ def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bodies:
 
     trunk, own = physics.model.body("trunk"), physics.model
     friction = draw(*s.friction, 1)
-    physics.parameter("opt.o_friction")[:, :2] = friction
+    _set_friction(physics, friction)
     load = draw(*s.payload, 1) + trunk.mass.item()
     physics.parameter("body_mass")[:, trunk.id] = load[:, 0]
     inertia = torch.tensor(trunk.inertia) / trunk.mass.item()
@@ -224,3 +229,13 @@ def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bodies:
     traits = [value * scale for value, scale in zip(differs, scales, strict=True)]
     traits = torch.cat((*traits, 3.0 * dry, 25.0 * delay), dim=-1).float()
     return Bodies(late, traits)
+
+
+def _set_friction(physics: Physics, friction: Float[Tensor, "sims 1"]) -> None:
+    """Set the sliding friction of all contacts, or of the feet where each shape has its own."""
+    model = physics.model
+    if model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_OVERRIDE):
+        physics.parameter("opt.o_friction")[:, :2] = friction
+    else:
+        feet = [model.geom(f"{leg}_foot").id for leg in LEGS]
+        physics.parameter("geom_friction")[:, feet, 0] = friction
