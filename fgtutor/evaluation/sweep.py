@@ -283,7 +283,8 @@ def run(config: SweepConfig) -> int:
             table=table(rows, option),
             caption=f"Success in % with 95 % intervals, {config.trials} crossings of held-out "
             f"terrain per training, each with its own plan; r_v and calibration error there are "
-            f"means over the seeds; robot {config.robot}{iterations}.",
+            f"means over the seeds; robot {config.robot}{iterations}; undisturbed, but r_v and "
+            "calibration error as disturbed as in training.",
             figures={"success.svg": report.shares_chart(groups, title)},
         )
 
