@@ -29,9 +29,10 @@ from fgtutor.policies.symmetry import Mirror, SymmetricMLPModel
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.robots.a1.env import A1Env, A1EnvConfig
 from fgtutor.robots.a1.model import MIRROR, MIRROR_SIGNS
+from fgtutor.robots.a1.randomise import WIDE
 from fgtutor.robots.crossings import EnvConfig
 from fgtutor.robots.toy import ToyEnv
-from fgtutor.specialist import load_specialist, save_specialist
+from fgtutor.specialist import ZOO, load_specialist, save_specialist
 from fgtutor.world.terrain import Terrain, World, make_terrain
 
 robots = pytest.mark.parametrize("robot", sorted(ROBOTS))
@@ -477,6 +478,34 @@ def test_a_resumed_run_equals_an_unbroken_one_bit_for_bit(robot, tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(state(whole), state(again), strict=True))
     assert first["context_velocity"] == second["context_velocity"]
     assert not torch.equal(saved[-1], state(again)[-1])
+
+
+@pytest.mark.slow
+def test_an_estimating_run_starts_from_a_shipped_policy_and_resumes_exactly(tmp_path):
+    options = {"actor": "estimating", "hidden": (256, 128), "critic_warmup": 1, "terrain": "steps"}
+    start = ZOO / "a1" / "steps"
+    config = A1TrainConfig(out=tmp_path / "a", start_from=start, **TINY | options)
+    run, told = Trainer(config), load_specialist(start)
+    own, theirs = (policy.mlp.state_dict() for policy in (run.algorithm.get_policy(), told.policy))
+    assert torch.equal(own["2.weight"], theirs["2.weight"])
+    assert torch.equal(own["0.weight"][:, 47:50], theirs["0.weight"][:, :3])
+    nets = (run.algorithm.feasibility.state_dict(), told.feasibility.state_dict())
+    assert all(torch.equal(nets[0][name], value) for name, value in nets[1].items())
+    run.iterate()
+    run.iterate()
+    run.save()
+    first = run.iterate()
+    again = Trainer(config)
+    again.resume()
+    second = again.iterate()
+    assert all(second[name] == value for name, value in first.items() if name != "seconds")
+    conditions = run.specialist().provenance["conditions"]["settings"]
+    assert conditions["friction"] == WIDE.friction and conditions["delay"] == WIDE.delay
+
+
+def test_a_robot_without_wide_disturbances_says_so(tmp_path):
+    with pytest.raises(ConfigError, match="toy knows no wide disturbances"):
+        Trainer(tiny(tmp_path, disturbances="wide"))
 
 
 @pytest.mark.slow
