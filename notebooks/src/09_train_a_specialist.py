@@ -57,6 +57,7 @@ iterations = budget(fast=4, full=60, unit="iterations of 40 steps", each=2.0)
 config = A1TrainConfig(
     terrain="steps", rows=5, columns=2, num_envs=robots, iterations=iterations,
     start_from=walker, critic_warmup=2, save_every=20,
+    actor="perceptive", disturbances="usual", turned=0.0,  # as the walker learned
     out=Path("runs") / f"09-steps-{robots}-{iterations}",
 )  # fmt: skip
 
