@@ -5,6 +5,7 @@
 #   make lab        JupyterLab on the first notebook, on this machine only
 #   make notebooks  execute the notebooks' sources     make exercises  build them from their masters
 #   make test-wheel install wheel and source archive into fresh environments of each Python, and use them
+#   make bench      every benchmark, about half an hour     make bench-quick  under three minutes
 #   make check      lint, types, imports
 #   make clean      remove what the targets made (.venv too)
 # PYTHON=/path/to/python chooses the interpreter for .venv (3.11 to 3.14).
@@ -14,7 +15,7 @@ BIN := $(VENV)/bin
 BASE := $(VENV)/.installed-base
 ALL := $(VENV)/.installed-all
 
-.PHONY: demo browser lab notebooks exercises test test-fast test-wheel check clean
+.PHONY: demo browser lab notebooks exercises test test-fast test-wheel bench bench-quick check clean
 .DELETE_ON_ERROR:
 
 demo: $(BASE)
@@ -50,6 +51,10 @@ exercises: $(ALL)
 
 test-wheel:
 	.ci/test-wheel
+
+# The machine should be idle; benchmarks/README.md says how to read what comes out.
+bench bench-quick: $(VENV)/.installed-bench
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/run.py $(if $(filter %-quick,$@),--quick)
 
 check: $(ALL)
 	$(BIN)/ruff check
@@ -87,4 +92,8 @@ $(BASE): pyproject.toml constraints.txt | $(VENV)/bin/python
 
 $(ALL): pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(INSTALL) --editable '.[lab,dev]'
+	@touch $(BASE) $@
+
+$(VENV)/.installed-bench: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(INSTALL) --editable '.[bench]'
 	@touch $(BASE) $@

@@ -1,62 +1,64 @@
-"""Measure the A1's environment against its bare physics: how much of a control step is MuJoCo?
+"""The robots' environments against their bare physics: what a control step costs beside MuJoCo.
 
-Run `python benchmarks/bench_env.py`. The shipped specialist walks its own training world. In every
-control step the time inside `mujoco.batch` is measured apart, so both stand on the same states: its
-share is the environment's control steps per second over those of the bare physics. CPU seconds,
-which hardly feel the load of other programs.
+Shipped specialists walk their own training world. The time inside the physics is measured apart, so
+both stand on the same states; the ratio is a whole step over the physics in it, 1 at best.
 """
 
-import json
-import os
 import time
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
+from harness import Row, Size, row
 
-from fgtutor.learning.config import A1TrainConfig, make_training_env
-from fgtutor.robots.a1.env import A1Env
-from fgtutor.specialist import ZOO, load_specialist
+from fgtutor.learning.config import CONFIGS, make_training_env
+from fgtutor.specialist import load_zoo
 
 
-def measure(terrain: str, num_envs: int, control_steps: int) -> dict[str, str | float]:
-    """Return what one specialist's environment and its physics alone manage."""
-    config = A1TrainConfig(terrain=terrain, num_envs=num_envs, rows=4, columns=4)
-    env = make_training_env(config)
-    assert isinstance(env, A1Env)
-    policy = load_specialist(ZOO / "a1" / terrain).policy
-    env.reset_all()
-    bare, inside = env.physics.step, 0.0
+class Stopwatch:
+    """A function that keeps count of the CPU seconds spent in it."""
 
-    def timed(n: int = 1) -> None:
-        nonlocal inside
+    def __init__(self, function: Callable[..., object]) -> None:
+        self.function, self.seconds = function, 0.0
+
+    def __call__(self, *arguments: object, **options: object) -> object:
+        """Call the function."""
         began = time.process_time()
-        bare(n)
-        inside += time.process_time() - began
+        answer = self.function(*arguments, **options)
+        self.seconds += time.process_time() - began
+        return answer
 
-    env.physics.step = timed
-    observation, whole = env.get_observations(), 0.0
+
+def shares(robot: str, terrain: str, num_envs: int, steps: int, rounds: int) -> list[float]:
+    """Return, for each round of control steps, the time of whole steps over that of physics."""
+    config: Any = CONFIGS[robot](terrain=terrain, num_envs=num_envs, rows=2, columns=2)
+    env: Any = make_training_env(config)
+    policy = load_zoo(robot)[terrain].policy
+    env.reset_all()
+    physics = env.physics if robot == "a1" else env.space
+    physics.step = inside = Stopwatch(physics.step)
+    observation, found = env.get_observations(), []
     with torch.inference_mode():
-        for step in range(control_steps + 10):
-            if step == 10:  # by then the robots walk
-                inside = whole = 0.0
-            actions = policy(observation)
-            began = time.process_time()
-            observation, *_ = env.step(actions)
-            whole += time.process_time() - began
-    steps = num_envs * control_steps
-    return {
-        "terrain": terrain,
-        "environment_steps_per_cpu_second": round(steps / whole),
-        "bare_steps_per_cpu_second": round(steps / inside),
-        "share": round(inside / whole, 3),
-    }
+        for number in range(rounds + 1):
+            inside.seconds = whole = 0.0
+            for _ in range(steps):
+                actions = policy(observation)
+                began = time.process_time()
+                observation, *_ = env.step(actions)
+                whole += time.process_time() - began
+            if number:  # by then the robots walk
+                found.append(whole / inside.seconds)
+    return found
 
 
-def main(num_envs: int = 640, control_steps: int = 50) -> None:
-    torch.set_num_threads(1)
-    for terrain in ("steps", "gaps", "bridge", "valley"):
-        print(json.dumps(measure(terrain, num_envs, control_steps)), flush=True)
-
-
-if __name__ == "__main__":
-    print(json.dumps({"cores": os.cpu_count()}))
-    main()
+def rows(size: Size) -> Iterator[Row]:
+    """Let both robots walk."""
+    toys, robots, steps, rounds = {
+        "full": (256, 640, 20, 3), "quick": (64, 256, 10, 3), "tiny": (2, 2, 2, 1)
+    }[size]  # fmt: skip
+    terrains = ("steps",) if size == "tiny" else ("steps", "gaps")
+    for robot, count in (("toy", toys), ("a1", robots)):
+        for terrain in terrains:
+            found = shares(robot, terrain, count, steps, rounds)
+            what = f"a control step / its bare physics, {robot} on {terrain}, {count} robots"
+            yield row("environment", what, found)

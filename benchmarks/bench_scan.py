@@ -1,13 +1,15 @@
-"""How long a scan and its map take: ray casting, and mapping clouds of up to ten million points.
+"""A scan and its map: casting the rays, and mapping clouds, against sorting the same points.
 
-Reads nothing; prints one row a terrain and one a cloud. Use: python benchmarks/bench_scan.py
+Mapping must at least bring the points of a cell together: a bare sort by cell is what it cannot do
+without.
 """
 
-import time
+from collections.abc import Iterator
 
 import numpy as np
+from harness import Row, Size, in_turns, ratios, row
 
-from fgtutor.robots.lidar import LidarConfig, scan_terrain, survey
+from fgtutor.robots.lidar import scan_terrain
 from fgtutor.world.scanning import map_points
 from fgtutor.world.terrain import make_terrain
 
@@ -25,29 +27,31 @@ def synthetic(points: int) -> np.ndarray:
     return np.stack((x, y, z), axis=-1)
 
 
-def main() -> None:
-    print("terrain     boxes  poses     points  wall s   cpu s")
-    for name in ("steps", "rubble"):
-        terrain = make_terrain(name, robot="a1", seed=1)
-        wall, cpu = time.perf_counter(), time.process_time()
+def sort_by_cell(cloud: np.ndarray) -> None:
+    """Sort points by the cell of 0.1 m that they lie in, and do nothing else."""
+    cells = np.floor(cloud[:, :2] / 0.1).astype(np.int64)
+    cloud[np.lexsort((cells[:, 1], cells[:, 0]))]
+
+
+def rows(size: Size) -> Iterator[Row]:
+    """Scan a terrain and map it; map synthetic clouds."""
+    clouds, rounds = {
+        "full": ((100_000, 1_000_000, 10_000_000), 3), "quick": ((100_000, 1_000_000), 2),
+        "tiny": ((20_000,), 1),
+    }[size]  # fmt: skip
+    if size != "tiny":
+        terrain = make_terrain("steps", robot="a1", seed=1)
         cloud = scan_terrain(terrain)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        print(
-            f"{name:10}{len(terrain.boxes):7}{len(survey(terrain)):7}{len(cloud):11}"
-            f"{wall:8.1f}{cpu:8.1f}",
-            flush=True,
-        )
-    print(f"({LidarConfig().rays} rays a pose)\n\npoints      cells  outliers  wall s   cpu s")
-    for points in (100_000, 1_000_000, 10_000_000):
+        ways = {"scan": lambda: scan_terrain(terrain), "map": lambda: map_points(cloud)}
+        times = in_turns(ways, 1 if size == "quick" else rounds)
+        place = f"casting the rays / mapping them, steps, {len(cloud):,} points"
+        yield row("scan", place, ratios(times, "scan", "map"))
+    for points in clouds:
         cloud = synthetic(points)
-        wall, cpu = time.perf_counter(), time.process_time()
-        scanned = map_points(cloud)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        print(
-            f"{points:9}{scanned.count.size:8}{scanned.outliers:10}{wall:8.1f}{cpu:8.1f}",
-            flush=True,
-        )
-
-
-if __name__ == "__main__":
-    main()
+        ways = {
+            "map": lambda cloud=cloud: map_points(cloud),
+            "sort": lambda cloud=cloud: sort_by_cell(cloud),
+        }
+        times = in_turns(ways, rounds)
+        what = f"mapping / sorting by cell, {points:,} points of {AREA[0]:g} x {AREA[1]:g} m"
+        yield row("scan", what, ratios(times, "map", "sort"))

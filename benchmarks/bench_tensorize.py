@@ -1,61 +1,70 @@
-"""How long assessing a map takes: reference against fast, four Feasibility-Nets of standard size.
+"""Tensorization against the batched gather, and against bare sgemm of the same multiplications.
 
-Reads nothing; prints one row a map. Use: python benchmarks/bench_tensorize.py [threads]
+The gather is the reference method: every patch is sampled by itself. sgemm multiplies as many rows
+by matrices of the same shapes, and does nothing else: what is above 1 over it is not arithmetic.
 """
 
-import resource
-import sys
-import time
-from types import SimpleNamespace
-from typing import Any
+from collections.abc import Iterator
 
-import numpy as np
 import torch
+from harness import Row, Size, in_turns, ratios, row
+from torch import nn
+from worlds import a1, built, natural
 
 from fgtutor.elevation import ElevationMap
-from fgtutor.feasibility import FeasibilityNet
-from fgtutor.patches import PatchGrid
-from fgtutor.tensorization import Method, assess
+from fgtutor.specialist import Specialist
+from fgtutor.tensorization import assess_all, reassess
 
-NETS = 4
+HEADINGS = 8
+ROWS = 512
+"""Rows of one multiplication: those of a tile."""
 
 
-def specialists() -> list[Any]:
-    """Return what `assess` reads of a specialist; the policies would not be asked."""
-    grid = PatchGrid()
-    return [
-        SimpleNamespace(
-            feasibility=FeasibilityNet(grid.num_points), grid=grid, command=(0.6, 0.0, 0.0)
-        )
-        for _ in range(NETS)
+def sgemm(zoo: dict[str, Specialist], patches: int) -> None:
+    """Multiply as assessing that many different patches does."""
+    matrices = [
+        layer.weight.detach().T.contiguous()
+        for one in zoo.values()
+        for layer in one.feasibility.modules()
+        if isinstance(layer, nn.Linear)
     ]
+    inputs = [torch.ones(ROWS, len(matrix)) for matrix in matrices]
+    for _ in range(patches // ROWS or 1):
+        for rows, matrix in zip(inputs, matrices, strict=True):
+            torch.mm(rows, matrix)
 
 
-def seconds(elevation: ElevationMap, team: list[Any], method: Method) -> float:
-    start = time.perf_counter()
-    for specialist in team:
-        assess(elevation, specialist, method)
-    return time.perf_counter() - start
+def rows(size: Size) -> Iterator[Row]:
+    """Measure on ground where no two patches are alike, and on ground that was built."""
+    cells, rounds = {"full": (128, 3), "quick": (48, 3), "tiny": (10, 1)}[size]
+    zoo = a1()
+    for kind, elevation in (("natural", natural(cells)), ("built", built(cells))):
+        ways = {
+            "fast": lambda here=elevation: assess_all(here, zoo),
+            "gather": lambda here=elevation: assess_all(here, zoo, "reference"),
+            "sgemm": lambda: sgemm(zoo, cells * cells * HEADINGS),
+        }
+        times = in_turns(ways, rounds)
+        place = f"{kind} ground, {cells} x {cells}, {len(zoo)} A1 policies"
+        yield row("tensorize", f"gather / ours, {place}", ratios(times, "gather", "fast"))
+        yield row("tensorize", f"ours / sgemm, {place}", ratios(times, "fast", "sgemm"))
+    yield from painted(size)
 
 
-def main() -> None:
-    torch.set_num_threads(int(sys.argv[1]) if len(sys.argv) > 1 else 1)
-    torch.manual_seed(0)
-    rng = np.random.default_rng(0)
-    team = specialists()
-    print(f"{NETS} nets, {torch.get_num_threads()} thread(s); seconds for all nets and headings")
-    print("cells       resolution   reference      fast   speed-up   peak memory")
-    for cells, resolution in ((128, 0.1), (128, 0.05), (256, 0.1), (256, 0.05)):
-        elevation = ElevationMap(rng.random((cells, cells)), resolution=resolution)
-        fast = min(seconds(elevation, team, "fast") for _ in range(2))
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        reference = seconds(elevation, team, "reference")
-        print(
-            f"{cells} x {cells}   {resolution:6.2f} m   {reference:9.2f} {fast:9.2f} "
-            f"{reference / fast:8.1f} x {peak:10.0f} MB",
-            flush=True,
-        )
-
-
-if __name__ == "__main__":
-    main()
+def painted(size: Size) -> Iterator[Row]:
+    """Measure a dot painted on a map against assessing the whole map anew."""
+    cells, rounds = {"full": (400, 2), "quick": (200, 1), "tiny": (30, 1)}[size]
+    name, specialist = next(iter(a1().items()))
+    before = natural(cells, 0.1)
+    heights = before.heights.copy()
+    heights[cells // 2, cells // 2] += 0.1
+    after, said = ElevationMap(heights, 0.1), assess_all(before, {name: specialist})
+    times = in_turns(
+        {
+            "whole": lambda: assess_all(after, {name: specialist}),
+            "stroke": lambda: reassess(said, after),
+        },
+        rounds,
+    )
+    what = f"whole map / painted dot, {cells} x {cells} of 0.1 m, 1 policy"
+    yield row("painted", what, ratios(times, "whole", "stroke"))
