@@ -1,6 +1,6 @@
 """Other ways to plan, through the same search: classical costs, one policy, parts of ours left out.
 
-Reads a map and a zoo; gives the layers F [nx, ny, 8] that `planning.plan` searches, one for each
+Reads a map and a zoo; gives the layers F [nx, ny, d] that `planning.plan` searches, one for each
 policy that may drive. So a baseline differs from ours in these layers and in nothing else.
 Sources: leggedrobotics/traversability_estimation (Wermelinger et al., "Navigation planning for
 legged robots in challenging terrain", 2016) for the traversability and the values of its
@@ -20,14 +20,14 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-from fgtutor.directions import NUM_HEADINGS
+from fgtutor.directions import HeadingCount, Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.fusion import fuse
 from fgtutor.io.validation import Count, Positive, check_fields
 from fgtutor.planning import Point, plan_on_map
 from fgtutor.routes import Refusal, Route
-from fgtutor.settings import PlanSettings, Taus
+from fgtutor.settings import HEADINGS, PlanSettings, Taus
 from fgtutor.specialist import GENERAL, Specialist
 from fgtutor.tensorization import Assessment, assess_all
 
@@ -172,6 +172,8 @@ class AssessedMap:
     """All policies, the generalist among them."""
     taus: Taus = "calibrated"
     """Thresholds of w_ood."""
+    headings: HeadingCount = HEADINGS
+    """The number of headings that cells can be left along."""
     _known: dict[str, Assessment] = field(default_factory=dict)
 
     @property
@@ -191,7 +193,8 @@ class AssessedMap:
             # ask for both.
             team = [name] if name == GENERAL else self.specialists
             asked = {member: self.zoo[member] for member in team}
-            self._known.update(assess_all(self.elevation, asked, taus=self.taus))
+            options = {"taus": self.taus, "headings": self.headings}
+            self._known.update(assess_all(self.elevation, asked, **options))
         return self._known[name]
 
     def tensors(self, *names: str) -> "Layers":
@@ -199,7 +202,7 @@ class AssessedMap:
         return {name: self.assessment(name).weighted() for name in names or self.specialists}
 
 
-Layers = dict[str, Float[Tensor, "nx ny 8"]]
+Layers = dict[str, Float[Tensor, "nx ny d"]]
 """F of each policy that may drive, by name."""
 Planner = Callable[[AssessedMap], Sequence[Layers]]
 """Gives the layers to plan on; of several, the cheapest route is taken."""
@@ -214,7 +217,7 @@ def single(name: str, ground: AssessedMap) -> Sequence[Layers]:
 
 def straight(name: str, ground: AssessedMap) -> Sequence[Layers]:
     """Plan for one policy as if it could take every step: straight on, without asking it."""
-    return [{name: torch.ones(*ground.elevation.shape, NUM_HEADINGS)}]
+    return [{name: torch.ones(*ground.elevation.shape, ground.headings)}]
 
 
 def ours(ground: AssessedMap) -> Sequence[Layers]:
@@ -231,7 +234,7 @@ def without_ood(ground: AssessedMap) -> Sequence[Layers]:
 def without_heading(ground: AssessedMap) -> Sequence[Layers]:
     """Ours with one number per cell, the mean of F_i over the headings."""
     tensors = ground.tensors()
-    return [{name: _all_headings(tensor.mean(dim=-1)) for name, tensor in tensors.items()}]
+    return [{name: _all_headings(tensor.mean(dim=-1), ground) for name, tensor in tensors.items()}]
 
 
 def without_fusion(ground: AssessedMap) -> Sequence[Layers]:
@@ -241,19 +244,23 @@ def without_fusion(ground: AssessedMap) -> Sequence[Layers]:
 
 def classical(cells: Cells, ground: AssessedMap) -> Sequence[Layers]:
     """Plan on a classical map, which knows of no policies; the generalist drives."""
-    return [{GENERAL: _all_headings(torch.from_numpy(cells(ground.elevation, ground.radius)))}]
+    values = torch.from_numpy(cells(ground.elevation, ground.radius))
+    return [{GENERAL: _all_headings(values, ground)}]
 
 
 def classical_switched(cells: Cells, ground: AssessedMap) -> Sequence[Layers]:
     """Plan on a classical map; our policy map P says which specialist drives."""
-    layer = _all_headings(torch.from_numpy(cells(ground.elevation, ground.radius)))
+    layer = _all_headings(torch.from_numpy(cells(ground.elevation, ground.radius)), ground)
     tensors = ground.tensors()
     _, policy_map = fuse(list(tensors.values()))
     return [{name: layer * (policy_map == i) for i, name in enumerate(tensors)}]
 
 
-def _all_headings(values: Float[Tensor, "nx ny"]) -> Float[Tensor, "nx ny 8"]:
-    return values[..., None].expand(-1, -1, NUM_HEADINGS)
+def _all_headings(values: Float[Tensor, "nx ny"], ground: AssessedMap) -> Float[Tensor, "nx ny d"]:
+    """Return what one number per cell says of steps: the least of the cells that each leaves."""
+    headings = Headings(ground.headings)
+    everywhere = values[..., None].expand(-1, -1, headings.count)
+    return torch.from_numpy(headings.least(everywhere.numpy()))
 
 
 def planners(zoo: Mapping[str, Specialist]) -> dict[str, Planner]:
@@ -284,13 +291,13 @@ def find_route(
 ) -> Route | Refusal:
     """Return the planner's cheapest route, whose `names` are the policies that may drive it.
 
-    `settings` and `changes` are those of `planning.plan`, but for the thresholds, which are the
-    map's. Raises `ConfigError` if the planner offers no layers.
+    `settings` and `changes` are those of `planning.plan`, but for the thresholds and headings,
+    which are the map's. Raises `ConfigError` if the planner offers no layers.
     """
     answers = []
     for layers in planner(ground):
         team = {name: ground.zoo[name] for name in layers}
-        options = {"settings": settings, "tensors": layers, **changes}
+        options = {"settings": settings, "tensors": layers, **changes, "headings": ground.headings}
         answers.append(plan_on_map(ground.elevation, team, start, goal, **options).answer)
     if not answers:
         raise ConfigError("this planner has no policy to plan for: the zoo is empty")

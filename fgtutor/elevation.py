@@ -6,7 +6,6 @@ heights at points and derived maps. Source: the paper's M in R^(W x H), Sec. III
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -16,7 +15,6 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from fgtutor import directions
 from fgtutor.errors import MapError, OffMapError
 from fgtutor.grid import cells_of, check_cells, coordinate_text, point_text
 from fgtutor.io import maps
@@ -103,11 +101,6 @@ class ElevationMap:
     def size(self) -> tuple[float, float]:
         """Length along x and along y, m."""
         return self.shape[0] * self.resolution, self.shape[1] * self.resolution
-
-    @cached_property
-    def known_steps(self) -> Bool[np.ndarray, "nx ny 8"]:
-        """Which steps along the headings start from and end on a known cell of the map."""
-        return directions.steps_within(self.known)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:

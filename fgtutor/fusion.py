@@ -1,18 +1,18 @@
 """Fuse the feasibility tensors of all specialists: the highest feasibility, and its policy.
 
-Reads F_i [nx, ny, 8], one per specialist; gives F_max and the policy map P, both [nx, ny, 8].
+Reads F_i [nx, ny, d], one per specialist; gives F_max and the policy map P, both [nx, ny, d].
 Source: paper, Sec. III-C (Eqs. 6-7).
 """
 
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fgtutor.directions import NUM_HEADINGS
+from fgtutor.directions import HeadingCount
 from fgtutor.errors import PlanningError
 from fgtutor.io.validation import numbers
 
@@ -20,12 +20,12 @@ Array = TypeVar("Array", Tensor, np.ndarray)
 
 
 def fuse(
-    tensors: Sequence[Float[Array, "nx ny 8"]],
-) -> tuple[Float[Array, "nx ny 8"], Int[Array, "nx ny 8"]]:
+    tensors: Sequence[Float[Array, "nx ny d"]],
+) -> tuple[Float[Array, "nx ny d"], Int[Array, "nx ny d"]]:
     """Return F_max = max_i F_i and P = argmax_i F_i; on a tie the first specialist is taken.
 
     The answer is of the kind of the first tensor, torch or numpy; P is int64. Raises
-    `PlanningError` if there is no tensor, if shapes differ or are no maps of 8 headings, or if a
+    `PlanningError` if there is no tensor, if shapes differ or are no maps of headings, or if a
     value is no feasibility from 0 to 1.
     """
     if len(tensors) == 0:
@@ -33,9 +33,10 @@ def fuse(
             "fuse needs at least one feasibility tensor, got none: add a specialist"
         )
     arrays = [numbers(f"tensor {i}", one, PlanningError) for i, one in enumerate(tensors)]
-    if arrays[0].ndim != 3 or arrays[0].shape[-1] != NUM_HEADINGS or not arrays[0].size:
+    shape = arrays[0].shape
+    if len(shape) != 3 or shape[-1] not in get_args(HeadingCount) or not arrays[0].size:
         raise PlanningError(
-            f"tensor 0 has shape {arrays[0].shape}, expected (nx, ny, {NUM_HEADINGS}): pass what "
+            f"tensor 0 has shape {shape}, expected (nx, ny, 8), or 16 or 32 headings: pass what "
             "tensorize gave"
         )
     for index, array in enumerate(arrays):

@@ -1,6 +1,6 @@
 """The graphs that planning searches, and Dijkstra's search: networkx to read, scipy to be fast.
 
-Reads feasibility tensors [nx, ny, 8]; gives graphs whose nodes are cells, or cells with a policy
+Reads feasibility tensors [nx, ny, d]; gives graphs whose nodes are cells, or cells with a policy
 once a change of policy costs something, and the cheapest chain of nodes between two cells.
 Source: paper, Sec. III-C (edge cost 1 / F_max). The switching cost is ours.
 """
@@ -8,6 +8,7 @@ Source: paper, Sec. III-C (edge cost 1 / F_max). The switching cost is ours.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import permutations
 
 import networkx
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from scipy.sparse import csgraph, csr_array
 
-from fgtutor import directions
+from fgtutor.directions import Headings, Window, overlap
 from fgtutor.io.machine import require_memory
 
 Cell = tuple[int, int]
@@ -28,29 +29,28 @@ LOOSE = 1.25
 """Beyond this multiple of the cost with free switching, a bound spares too few steps to pay."""
 STRIP_CELLS = 1 << 13
 """Cells whose edges are listed at a time."""
-_ORDER = np.argsort(directions.STEPS @ (-(1 << 20), -1))
-"""Headings by the cell they come from: scipy keeps the edges that enter a cell in that order."""
-_RANKS = np.argsort(_ORDER)
 CURE = "plan on a part of the map (ElevationMap.crop), on coarser cells, or with switch_cost=0"
 
 
-def check_memory(shape: tuple[int, int], policies: int, switch_cost: float) -> None:
+def check_memory(
+    shape: tuple[int, int], policies: int, switch_cost: float, headings: Headings
+) -> None:
     """Raise `TooLargeError` if an open map of this shape is too large to plan on.
 
     Without free memory Linux would end the process, after it has tensorized for minutes.
     """
     cells = shape[0] * shape[1]
     layers = policies if switch_cost else 1
-    arrays = (4 + 2 * policies) * cells * directions.NUM_HEADINGS * 8
-    edges = cells * layers * (directions.NUM_HEADINGS + layers - 1)
+    arrays = (4 + 2 * policies) * cells * headings.count * 8
+    edges = cells * layers * (headings.count + layers - 1)
     search = edges * EDGE + cells * layers * STATE
     work = f"planning over {shape[0]} x {shape[1]} cells for {policies}"
     require_memory(arrays + search, work, CURE)
 
 
 def as_networkx(
-    fused: Float[np.ndarray, "nx ny 8"],
-    policy_map: Int[np.ndarray, "nx ny 8"],
+    fused: Float[np.ndarray, "nx ny d"],
+    policy_map: Int[np.ndarray, "nx ny d"],
     *,
     f_min: float = 0.1,
     cost: str = "inverse",
@@ -61,17 +61,18 @@ def as_networkx(
     Edges carry `weight`, `heading`, `policy` and `feasibility`. `resolution` (m) matters only for
     `cost="length"`.
     """
+    headings = Headings.of(fused)
     graph = networkx.DiGraph()
     graph.add_nodes_from(np.ndindex(fused.shape[:2]))
     for ix, iy, heading in np.argwhere(fused >= f_min).tolist():
-        dx, dy = directions.STEPS[heading].tolist()
+        dx, dy = headings.steps[heading].tolist()
         neighbour = (ix + dx, iy + dy)
         if neighbour in graph:
             feasibility = float(fused[ix, iy, heading])
             graph.add_edge(
                 (ix, iy),
                 neighbour,
-                weight=float(step_cost(feasibility, heading, cost, resolution)),
+                weight=float(step_cost(feasibility, headings, heading, cost, resolution)),
                 heading=heading,
                 policy=int(policy_map[ix, iy, heading]),
                 feasibility=feasibility,
@@ -80,7 +81,7 @@ def as_networkx(
 
 
 def as_switching_networkx(
-    tensors: Float[np.ndarray, "policies nx ny 8"],
+    tensors: Float[np.ndarray, "policies nx ny d"],
     switch_cost: float,
     *,
     f_min: float = 0.1,
@@ -105,37 +106,44 @@ def as_switching_networkx(
     return graph
 
 
-def steps_of(shape: tuple[int, int]) -> Iterator[tuple[int, tuple, tuple]]:
-    """Give for every heading the cells that have a neighbour there, and those neighbours."""
-    for heading, step in enumerate(directions.STEPS.tolist()):
-        tail = tuple(slice(max(-d, 0), n - max(d, 0)) for d, n in zip(step, shape, strict=True))
-        head = tuple(slice(max(d, 0), n - max(-d, 0)) for d, n in zip(step, shape, strict=True))
-        yield heading, tail, head
+def steps_of(shape: tuple[int, int], headings: Headings) -> Iterator[tuple[int, Window, Window]]:
+    """Give for every heading the cells whose step stays on the map, and where the steps end."""
+    for heading, step in enumerate(headings.steps.tolist()):
+        yield heading, *overlap(shape, step)
 
 
 def step_cost(
-    feasibility: ArrayLike, heading: int | np.ndarray, cost: str, resolution: float
+    feasibility: ArrayLike,
+    headings: Headings,
+    heading: int | np.ndarray,
+    cost: str,
+    resolution: float,
 ) -> np.ndarray:
-    """Return 1 / F, times the step's length in metres for `cost="length"`."""
+    """Return 1 / F, times the step's length in metres for `cost="length"`.
+
+    The paper's eight headings all lead to a neighbour. A longer step replaces several of those and
+    is no cheaper: for `cost="inverse"` it costs 1 / F for each of its king's moves.
+    """
     inverse = 1.0 / np.asarray(feasibility, dtype=np.float64)
     if cost == "inverse":
-        return inverse
-    return inverse * directions.STEP_LENGTHS[heading] * resolution
+        return inverse * headings.moves[heading]
+    return inverse * headings.lengths[heading] * resolution
 
 
 def reversed_graph(
-    layers: Float[np.ndarray, "layers nx ny 8"], switch_cost: float, cost: str, resolution: float
+    layers: Float[np.ndarray, "layers nx ny d"], switch_cost: float, cost: str, resolution: float
 ) -> csr_array:
     """Build the graph of all layers backwards, for a search from the goal: row head, column tail.
 
     States are (layer, ix, iy), flattened; a value of 0 is no edge. Costs are those of
     `as_networkx`, and of `as_switching_networkx` where there are several layers. An edge for every
-    pair of policies and heading would be 8 K^2 per cell. Mostly the old policy can take every step
+    pair of policies and heading would be d K^2 per cell. Mostly the old policy can take every step
     that the new one can: then one edge, which stays in the cell, changes the policy for all of
     them. Raises `TooLargeError` if the graph does not fit into memory.
     """
-    count, nx, ny, _ = layers.shape
-    able = np.packbits(layers > 0, axis=-1)  # one bit per heading: sets of steps as bytes
+    headings, (count, nx, ny, d) = Headings.of(layers), layers.shape
+    # One bit per heading, so that a set of steps is one number.
+    able = np.packbits(layers > 0, axis=-1).view(f"u{d // 8}")
     changes = {
         (old, new): _changes(able[old], able[new]) for old, new in permutations(range(count), 2)
     }
@@ -152,24 +160,25 @@ def reversed_graph(
     )
     columns, weights = np.empty(total, dtype=np.int32), np.empty(total)
     degrees, filled = np.zeros(states + 1, dtype=np.int32), 0
-    into = np.append(-(directions.STEPS[_ORDER] @ (ny, 1)), 0)  # from a step's end to its start
+    order = _order(headings)
+    into = np.append(-(headings.steps[order] @ (ny, 1)), 0)  # from a step's end to its start
     for new in range(count):
-        entering = _entering(layers[new]).reshape(-1, 8)
-        there, tails = [entering > 0], [new * nx * ny + into[:8]]
+        entering = _entering(layers[new], headings).reshape(-1, d)
+        there, tails = [entering > 0], [new * nx * ny + into[:d]]
         for old in (old for old in range(count) if old != new):
-            # A ninth kind of edge stays in the cell and costs nothing but the change.
+            # One more kind of edge stays in the cell and costs nothing but the change.
             inside, along = changes[old, new]
-            leaving = _entering(np.unpackbits(along, axis=-1).view(bool))
-            there += [leaving.reshape(-1, 8), inside.reshape(-1, 1)]
+            leaving = np.unpackbits(along.view(np.uint8), axis=-1).view(bool)
+            there += [_entering(leaving, headings).reshape(-1, d), inside.reshape(-1, 1)]
             tails.append(old * nx * ny + into)
         tail = np.concatenate(tails).astype(np.int32)
         cells = np.flatnonzero((able[new].ravel() != 0) | there[0].any(axis=1)).astype(np.int32)
         for some in np.array_split(cells, -(-len(cells) // STRIP_CELLS) or 1):
             mask = np.concatenate([part[some] for part in there], axis=1)
             with np.errstate(divide="ignore"):  # where there is no step F is 0, and the mask False
-                step = step_cost(entering[some], _ORDER, cost, resolution)
-            change = np.full((len(step), 9), float(switch_cost))
-            change[:, :8] += step
+                step = step_cost(entering[some], headings, order, cost, resolution)
+            change = np.full((len(step), d + 1), float(switch_cost))
+            change[:, :d] += step
             chosen = np.flatnonzero(mask)
             end = filled + len(chosen)
             columns[filled:end] = (some[:, None] + tail).ravel().take(chosen)
@@ -188,22 +197,27 @@ def _changes(
 ) -> tuple[Bool[np.ndarray, "nx ny 1"], Int[np.ndarray, "nx ny 1"]]:
     """Say where the policy may change for every step of the new one, and else for which steps."""
     inside = (new != 0) & (new & ~old == 0)
-    return inside, np.where(inside, 0, old & new).astype(np.uint8)
+    return inside, np.where(inside, 0, old & new).astype(old.dtype)
 
 
-def _entering(leaving: np.ndarray) -> np.ndarray:
+def _order(headings: Headings) -> Int[np.ndarray, " d"]:
+    """Sort headings by the cell they come from, as scipy keeps the edges that enter a cell."""
+    return np.argsort(headings.steps @ (-(1 << 20), -1))
+
+
+def _entering(leaving: np.ndarray, headings: Headings) -> np.ndarray:
     """Move what is said of the step that leaves a cell to where it ends, in the order of tails."""
-    moved = np.zeros_like(leaving)
-    for heading, tail, head in steps_of(leaving.shape[:2]):
-        moved[(*head, _RANKS[heading])] = leaving[(*tail, heading)]
-    return moved
+    entering, ranks = np.zeros_like(leaving), np.argsort(_order(headings))
+    for heading, tail, head in steps_of(leaving.shape[:2], headings):
+        entering[(*head, ranks[heading])] = leaving[(*tail, heading)]
+    return entering
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
     """Dijkstra's search over layers of feasibility: one for free switching, else one per policy."""
 
-    layers: Float[np.ndarray, "layers nx ny 8"]
+    layers: Float[np.ndarray, "layers nx ny d"]
     """F of each step, 0 where there is none."""
     switch_cost: float
     """Cost of changing the layer, in the unit of `cost`."""
@@ -211,6 +225,15 @@ class Search:
     """Cost of a step, as in `step_cost`."""
     resolution: float
     """Side of a cell, m."""
+
+    @cached_property
+    def headings(self) -> Headings:
+        """What the layers' last axis counts."""
+        return Headings.of(self.layers)
+
+    def step_cost(self, feasibility: ArrayLike, heading: int | np.ndarray) -> np.ndarray:
+        """Return what steps cost, as `step_cost` does."""
+        return step_cost(feasibility, self.headings, heading, self.cost, self.resolution)
 
     def networkx(self, start: Cell, goal: Cell) -> Int[np.ndarray, "n 3"] | None:
         """Search forwards in the graph that people read; answer as `scipy`."""
@@ -296,10 +319,10 @@ class Search:
 
     def _cost_along(self, cells: Int[np.ndarray, "n 2"]) -> float:
         """Return the least cost of driving along `cells`; infinite if policies cannot hand over."""
-        headings = headings_of(cells)
+        headings = self.headings.index_of(np.diff(cells, axis=0))
         f = self.layers[:, cells[:-1, 0], cells[:-1, 1], headings]
         with np.errstate(divide="ignore"):
-            costs = step_cost(f, headings, self.cost, self.resolution)
+            costs = self.step_cost(f, headings)
         least = np.zeros(len(f))
         for cost in costs.T:  # a change needs the old and the new policy to be able to take a step
             able = np.isfinite(cost)
@@ -310,7 +333,7 @@ class Search:
 
     def _within(
         self, graph: csr_array, start: Cell, distance: Float[np.ndarray, " cells"], bound: float
-    ) -> Bool[np.ndarray, "nx ny 8"]:
+    ) -> Bool[np.ndarray, "nx ny d"]:
         """Return the steps of the only layer that lie on a chain which costs `bound` or less."""
         layer = self.layers[0]
         shape = layer.shape[:2]
@@ -319,16 +342,10 @@ class Search:
         onward = distance.reshape(shape)
         keep = layer > 0
         with np.errstate(divide="ignore"):
-            for heading, tail, head in steps_of(shape):
-                cost = step_cost(layer[(*tail, heading)], heading, self.cost, self.resolution)
+            for heading, tail, head in steps_of(shape, self.headings):
+                cost = self.step_cost(layer[(*tail, heading)], heading)
                 keep[(*tail, heading)] &= there[tail] + cost + onward[head] <= bound
         return keep
-
-
-def headings_of(cells: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, " steps"]:
-    """Return the heading of each step of a chain of neighbouring cells."""
-    steps = np.diff(cells, axis=0)
-    return np.equal(steps[:, None], directions.STEPS).all(axis=-1).argmax(axis=-1)
 
 
 def _minus(cell: Cell, corner: np.ndarray) -> Cell:

@@ -1,12 +1,13 @@
 """Plan a route: Dijkstra's search over the fused feasibility tensor, or the reason there is none.
 
-Reads F_max and the policy map P (numpy or torch, [nx, ny, 8]), the map they belong to, a start and
+Reads F_max and the policy map P (numpy or torch, [nx, ny, d]), the map they belong to, a start and
 a goal in metres; gives a `Route` that says for every step the heading, the policy and why, or a
 `Refusal`. `plan_on_map` does every stage, from the map to the route.
 Source: paper, Sec. III-C (edge cost 1 / F_max, policy by Eq. 7). The switching cost is ours: the
 paper names its absence as a limit of the method.
 
-Every cell is a node, and F_max[ix, iy, k] >= f_min makes an edge to the neighbour along heading k.
+Every cell is a node, and F_max[ix, iy, k] >= f_min makes an edge to the cell that the
+step along heading k leads to.
 `graphs` builds that graph and searches it, in networkx for reading and in scipy for speed; once
 switching costs something, a node is a cell with a policy.
 """
@@ -23,7 +24,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from fgtutor import directions
+from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import (
     ConfigError,
@@ -40,8 +41,6 @@ from fgtutor.graphs import (
     as_networkx,
     as_switching_networkx,
     check_memory,
-    headings_of,
-    step_cost,
     steps_of,
 )
 from fgtutor.grid import coordinate_text, point_text
@@ -67,7 +66,7 @@ __all__ = [
 
 Point = tuple[float, float]
 
-SECONDS_PER_STATE = 1.5e-6
+SECONDS_PER_STEP = 1.9e-7
 """What a search takes, in one call that cannot show how far it is (measured, 4 policies)."""
 
 
@@ -81,13 +80,13 @@ class Plan:
     names: tuple[str, ...]
     """The policies, in the order that indices count."""
     tensors: list[Tensor]
-    """F_i of each policy, [nx, ny, 8]."""
+    """F_i of each policy, [nx, ny, d]."""
     weights: dict[str, Tensor]
-    """w_ood of each policy that was assessed, [nx, ny, 8], by name."""
+    """w_ood of each policy that was assessed, [nx, ny, d], by name."""
     fused: Tensor
-    """F_max, [nx, ny, 8]."""
+    """F_max, [nx, ny, d]."""
     policy_map: Tensor
-    """P, [nx, ny, 8]."""
+    """P, [nx, ny, d]."""
     answer: Route | Refusal
     """The cheapest route, or why there is none."""
 
@@ -103,15 +102,16 @@ class Plan:
         """
         if isinstance(self.answer, Route) or self.answer.nearest is None:
             return []
+        headings = Headings.of(self.fused)
         at = (*elevation.cell_of(*self.answer.nearest), self.answer.heading)
-        if not elevation.known_steps[at]:
+        if not headings.steps_within(elevation.known)[at]:
             return ["The step on from there leads onto ground that was never observed."]
         place = point_text(self.answer.nearest, elevation.resolution)
-        reasons = [f"On from {place} m towards {directions.NAMES[at[-1]]}:"]
+        reasons = [f"On from {place} m towards {headings.names[at[-1]]}:"]
         for name, tensor in zip(self.names, self.tensors, strict=True):
             reason = f"{name}: F = {float(tensor[at]):.2f}"
             if name in self.weights:  # not of a tensor that was given
-                w_ood = float(self.weights[name][at])
+                w_ood = float(headings.least(self.weights[name].numpy())[at])
                 known = "it knows such ground" if w_ood >= 0.5 else "it has hardly seen such ground"
                 reason += f", w_ood = {w_ood:.2f} ({known})"
             reasons.append(reason)
@@ -140,7 +140,8 @@ def plan_on_map(
     if not zoo:
         raise ConfigError("planning needs at least one specialist, the zoo is empty")
     settings = replace(settings or PlanSettings(), **changes)
-    check_memory(elevation.shape, len(zoo), settings.switch_cost)
+    headings = Headings(settings.headings)
+    check_memory(elevation.shape, len(zoo), settings.switch_cost, headings)
     try:
         for point, role in ((start, "start"), (goal, "goal")):
             usable_cell(elevation, point, role, settings.unknown)
@@ -149,14 +150,15 @@ def plan_on_map(
         return Plan(tuple(zoo), [], {}, nothing, nothing, Refusal(error))
     known, weights = dict(tensors or {}), {}
     asked = {name: one for name, one in zoo.items() if name not in known}
-    assessments = assess_all(elevation, asked, taus=settings.taus, progress=progress)
+    options = {"taus": settings.taus, "headings": settings.headings, "progress": progress}
+    assessments = assess_all(elevation, asked, **options)
     for name in asked:  # each is let go as soon as it is weighted: large maps need the memory
         weights[name], known[name] = assessments.pop(name).weigh(unknown=settings.unknown)
     each = [known[name] for name in zoo]
     fused, policy_map = fuse(each)
-    states = elevation.heights.size * (len(zoo) if settings.switch_cost else 1)
-    if progress and states * SECONDS_PER_STATE > QUICK:
-        expected = duration(states * SECONDS_PER_STATE)
+    steps = elevation.heights.size * headings.count * (len(zoo) if settings.switch_cost else 1)
+    if progress and steps * SECONDS_PER_STEP > QUICK:
+        expected = duration(steps * SECONDS_PER_STEP)
         print(f"searching the route: about {expected}", file=sys.stderr)
     answer = plan(
         fused,
@@ -190,17 +192,18 @@ def plan(
     chain of steps joins them; `.raise_for()` of the answer gives the route or raises the reason.
 
     Args:
-        fused: F_max [nx, ny, 8], from `fusion.fuse`.
-        policy_map: P [nx, ny, 8], from `fusion.fuse`.
+        fused: F_max [nx, ny, d], from `fusion.fuse`.
+        policy_map: P [nx, ny, d], from `fusion.fuse`.
         grid: The map that was tensorized.
         start: Where the robot stands, m.
         goal: Where it shall go, m.
         settings: How to plan; default: `PlanSettings()`, which is ours.
-        tensors: F_i [nx, ny, 8] of every policy. A cost of switching needs them; without them, and
+        tensors: F_i [nx, ny, d] of every policy. A cost of switching needs them; without them, and
             if nothing else is asked for, switching is free.
-        ood: w_ood [nx, ny, 8] of every policy, for explanations only.
+        ood: w_ood [nx, ny, d] of every policy, for explanations only.
         names: Names of the policies; default: "policy 0" and so on.
-        changes: Single fields of `PlanSettings` to change, such as `f_min=0.3`.
+        changes: Single fields of `PlanSettings` to change, such as `f_min=0.3`. The headings are
+            those of the tensors.
 
     Raises:
         OffMapError: Start or goal is off the map.
@@ -238,7 +241,9 @@ class _Problem:
         lists = {"tensors": tensors, "ood": ood, "names": names}
         given = {what: len(one) for what, one in lists.items() if one is not None}
         kept = given.get("tensors", 0) + given.get("ood", 0)
-        check_memory(grid.shape, kept, settings.switch_cost)
+        fused = numbers("fused", fused, PlanningError)
+        self.headings = Headings.of(fused)
+        check_memory(grid.shape, kept, settings.switch_cost, self.headings)
         self.fused = self._fit("fused", [fused])[0]
         policies = self._fit("policy_map", [policy_map])[0]
         self.policy_map = policies.astype(np.int64, copy=False)
@@ -263,17 +268,16 @@ class _Problem:
         paid = self.tensors if settings.switch_cost > 0 else None
         layers = self.fused[None] if paid is None else paid
         layers = layers.astype(np.result_type(layers.dtype, np.float32), copy=False)
-        known = grid.known_steps
-        if settings.unknown == "fill":
-            known = directions.steps_within(np.ones(grid.shape, dtype=bool))
-        usable = known & (layers >= np.float64(settings.f_min))
+        trusted = np.logical_or(grid.known, settings.unknown == "fill")
+        usable = self.headings.steps_within(trusted) & (layers >= np.float64(settings.f_min))
         self.layers = np.where(usable, layers, layers.dtype.type(0))
+        self.search = Search(self.layers, settings.switch_cost, settings.cost, grid.resolution)
 
     def _fit(self, name: str, arrays: Sequence[ArrayLike]) -> np.ndarray:
         """Stack arrays, or raise `PlanningError` if they do not fit the map."""
         if not len(arrays):
             raise PlanningError(f"{name} is empty: give one array for every policy")
-        shape = (*self.grid.shape, directions.NUM_HEADINGS)
+        shape = (*self.grid.shape, self.headings.count)
         each = [numbers(name, array, PlanningError) for array in arrays]
         for array in each:
             if array.shape != shape:
@@ -293,13 +297,10 @@ class _Problem:
         if ends[0] == ends[1]:
             return self._route(np.array([[0, *ends[0]]]))
         self._check_open(start, goal)
-        search = Search(
-            self.layers, self.settings.switch_cost, self.settings.cost, self.grid.resolution
-        )
         networked = self.settings.backend == "networkx"
-        states = search.networkx(*ends) if networked else search.scipy(*ends)
+        states = self.search.networkx(*ends) if networked else self.search.scipy(*ends)
         if states is None:
-            nearest, heading = self._nearest(search.reached(ends[0]), ends[1])
+            nearest, heading = self._nearest(self.search.reached(ends[0]), ends[1])
             error = UnreachableError(
                 f"start {self._text(start)} m, cell {ends[0]}, and goal {self._text(goal)} m, cell "
                 f"{ends[1]}, can both be used, but no chain of steps with F >= "
@@ -314,21 +315,18 @@ class _Problem:
         """Return the reached cell nearest to the goal, m, and the heading on from it."""
         cells = np.argwhere(reached)
         cell = cells[((cells - goal) ** 2).sum(axis=1).argmin()]
-        heading = int(
-            (directions.STEPS / directions.STEP_LENGTHS[:, None] @ (goal - cell)).argmax()
-        )
-        return self.grid.centre_of(*cell.tolist()), heading
+        return self.grid.centre_of(*cell.tolist()), self.headings.towards(goal - cell)
 
     def _route(self, states: np.ndarray) -> Route:
         """Describe a chain of states (layer, ix, iy); of a cell's states the first came there."""
         came = np.append(True, np.diff(states[:, 1:], axis=0).any(axis=1))
         layer, cells = states[came, 0], states[came, 1:]
-        headings = headings_of(cells)
+        headings = self.headings.index_of(np.diff(cells, axis=0))
         at = (*cells[:-1].T, headings)
         x, y = self.grid.centres
         policies = layer[1:] if self.settings.switch_cost > 0 else self.policy_map[at]
         feasibility = self.layers[(layer[1:], *at)]
-        costs = step_cost(feasibility, headings, self.settings.cost, self.grid.resolution)
+        costs = self.search.step_cost(feasibility, headings)
         return Route(
             cells=cells,
             xy=np.stack((x[cells[:, 0]], y[cells[:, 1]]), axis=-1),
@@ -336,8 +334,9 @@ class _Problem:
             policies=policies,
             feasibility=feasibility,
             costs=costs + self.settings.switch_cost * (np.diff(layer) != 0),
-            length=float(directions.STEP_LENGTHS[headings].sum() * self.grid.resolution),
+            length=float(self.headings.lengths[headings].sum() * self.grid.resolution),
             names=self.names,
+            num_headings=self.headings.count,
             choices=None if self.tensors is None else self.tensors[(slice(None), *at)].T,
             ood=None if self.ood is None else self.ood[(slice(None), *at)].T,
         )
@@ -351,11 +350,11 @@ class _Problem:
             best = int(self.fused[cell].argmax())
             raise InfeasibleCellError(
                 f"no policy can leave the start {self._text(start)} m, cell {cell}: its "
-                f"best F_max is {self.fused[cell][best]:.3g}, towards {directions.NAMES[best]}; "
+                f"best F_max is {self.fused[cell][best]:.3g}, towards {self.headings.names[best]}; "
                 f"move the start, {cure}"
             )
         entered = np.zeros(self.grid.shape, dtype=bool)
-        for heading, tail, head in steps_of(self.grid.shape):
+        for heading, tail, head in steps_of(self.grid.shape, self.headings):
             entered[head] |= leaving[(*tail, heading)] > 0
         if not entered[end]:
             raise InfeasibleCellError(

@@ -14,7 +14,7 @@ import numpy as np
 from annotated_types import Interval, Len
 from jaxtyping import Float, Int
 
-from fgtutor import directions
+from fgtutor.directions import HeadingCount, Headings
 from fgtutor.errors import PlanningError
 from fgtutor.io.validation import parse_record
 
@@ -58,6 +58,7 @@ class Route:
 
     Raises:
         PlanningError: The arrays do not fit each other, or a value is out of range.
+        ConfigError: There is no such number of headings.
     """
 
     cells: Int[np.ndarray, "n 2"]
@@ -76,13 +77,15 @@ class Route:
     """Length along the cell centres, m."""
     names: tuple[str, ...]
     """Names of all policies that were planned with."""
+    num_headings: HeadingCount = 8
+    """How many headings `headings` count: 8, 16 or 32."""
     choices: Float[np.ndarray, "steps policies"] | None = None
     """F_i of every policy at each step, if known."""
     ood: Float[np.ndarray, "steps policies"] | None = None
-    """w_ood of every policy at each step, if known."""
+    """w_ood of every policy in the cell that each step leaves first, if known."""
 
     def __post_init__(self) -> None:
-        names, headings = self.names, len(directions.NAMES)
+        names, headings = self.names, Headings(self.num_headings)
         if not names or not all(isinstance(n, str) and n.isprintable() for n in names):
             raise PlanningError(f"names should be printable texts, one per policy, got {names}")
         if len(set(names)) < len(names):
@@ -98,11 +101,11 @@ class Route:
                 raise PlanningError(f"{name} should hold {kind.__name__}, holds {array.dtype}")
             if not (np.abs(array) <= LARGEST).all():
                 raise PlanningError(f"{name} should hold finite numbers up to {LARGEST:g}")
-        for what, count in (("headings", headings), ("policies", len(names))):
+        for what, count in (("headings", headings.count), ("policies", len(names))):
             if not all(0 <= index < count for index in getattr(self, what).tolist()):
                 raise PlanningError(f"{what} should be numbers from 0 to {count - 1}")
-        if (np.diff(self.cells.astype(int), axis=0) != directions.STEPS[self.headings]).any():
-            raise PlanningError("each cell should be the last one's neighbour along the heading")
+        if (np.diff(self.cells.astype(int), axis=0) != headings.steps[self.headings]).any():
+            raise PlanningError("each cell should be where the heading leads from the last one")
         if not (0 <= self.length <= LARGEST and (self.costs >= 0).all()):
             raise PlanningError("length and costs should be numbers from 0")
 
@@ -122,12 +125,12 @@ class Route:
 
     def explain(self) -> list[dict[str, Any]]:
         """Say for every step where it goes, with which policy, and what the others offered."""
-        total = self.cost
+        total, names = self.cost, Headings(self.num_headings).names
         steps = []
         for i, heading in enumerate(self.headings.tolist()):
             step = {
                 "cell": tuple(self.cells[i].tolist()),
-                "heading": directions.NAMES[heading],
+                "heading": names[heading],
                 "policy": self.names[self.policies[i]],
                 "F_max": float(self.feasibility[i]),
                 "cost": float(self.costs[i]),
@@ -157,12 +160,12 @@ class Route:
         layout = _layout(len(record["cells"]) - 1, len(record["names"]))
         try:
             # An empty list has lost its other dimensions: give them back.
-            arrays = {
+            arrays: dict[str, Any] = {
                 name: np.array(record[name], dtype=kind).reshape(shape)
                 for name, (kind, shape) in layout.items()
                 if record[name] is not None
             }
-            return cls(length=record["length"], names=record["names"], **arrays)
+            return cls(**arrays | {name: record[name] for name in _KEPT})
         except ValueError as error:
             raise PlanningError(f"{told}: {error}") from error
 
@@ -178,6 +181,8 @@ class Route:
         )
 
 
+_KEPT = ("length", "names", "num_headings")
+"""What of a route is no array."""
 _Index = Annotated[int, Interval(ge=0, le=10**6)]
 
 
@@ -193,6 +198,7 @@ class _Record:
     costs: list[float]
     length: float
     names: tuple[str, ...]
+    num_headings: HeadingCount = 8  # what a route was before it said so
     choices: list[list[float]] | None
     ood: list[list[float]] | None
     cost: float

@@ -9,12 +9,16 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
+from fgtutor.directions import HeadingCount
 from fgtutor.io.validation import Count, NonNegative, Positive, check_fields
 
 Taus = Literal["paper", "calibrated"] | tuple[float, float]
 Unknown = Literal["block", "fill"]
 Backend = Literal["auto", "networkx", "scipy"]
 Cost = Literal["inverse", "length"]
+
+HEADINGS: HeadingCount = 8
+"""The number of headings d unless another is asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +27,8 @@ class PlanSettings:
 
     taus: Taus = "calibrated"
     """Thresholds of w_ood: "calibrated" (each specialist's own), "paper", or a pair for all."""
+    headings: HeadingCount = HEADINGS
+    """d, the number of headings: 8 (the paper's, to the neighbouring cells), 16 or 32."""
     cost: Cost = "length"
     """Cost of a step: "inverse" is 1 / F (the paper, by which a diagonal step costs no more than a
     straight one and routes zigzag), "length" is that times the step's metres."""
@@ -46,13 +52,13 @@ class PlanSettings:
     def __str__(self) -> str:
         taus = self.taus if isinstance(self.taus, str) else "{:g} to {:g}".format(*self.taus)
         return (
-            f"tau {taus}, f_min {self.f_min:g}, cost {self.cost}, switch cost "
-            f"{self.switch_cost:g}, hysteresis of {self.hold_steps} steps"
+            f"tau {taus}, {self.headings} headings, f_min {self.f_min:g}, cost {self.cost}, "
+            f"switch cost {self.switch_cost:g}, hysteresis of {self.hold_steps} steps"
         )
 
 
-PAPER = PlanSettings(taus="paper", cost="inverse", switch_cost=0.0, hold_steps=1)
-"""The paper's own: tau 0.1 and 2.0, cost 1 / F, free switching, no hysteresis."""
+PAPER = PlanSettings(taus="paper", headings=8, cost="inverse", switch_cost=0.0, hold_steps=1)
+"""The paper's own: tau 0.1 and 2.0, 8 headings, cost 1 / F, free switching, no hysteresis."""
 SETTINGS = {"ours": PlanSettings(), "paper": PAPER}
 """The two settings that have a name."""
 
@@ -65,6 +71,8 @@ class PlanOptions:
     """How to plan: our settings, or the paper's. The options below change one thing each."""
     taus: Literal["paper", "calibrated"] | None = None
     """Thresholds of w_ood: the paper's 0.1 and 2.0, or each specialist's own."""
+    headings: HeadingCount | None = None
+    """Headings that a cell can be left along (the paper's 8): more see ways off the axes."""
     cost: Cost | None = None
     """Cost of a step: 1 / F (inverse, the paper's), or that times the step's metres."""
     f_min: Annotated[float, Interval(gt=0, le=1)] | None = None

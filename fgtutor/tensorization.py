@@ -1,8 +1,9 @@
 """From elevation map to feasibility tensor: a window slides over the map, once per heading.
 
 Reads an `ElevationMap` M and a specialist (its Feasibility-Net, patch grid and planning command);
-gives f, L_recon and F_i = w_ood * f, all [nx, ny, 8].
-Source: paper, Sec. III-B (Eqs. 4-5).
+gives f, L_recon and F_i = w_ood * f, all [nx, ny, d].
+Source: paper, Sec. III-B (Eqs. 4-5). Steps over cells between their ends, and so more than 8
+headings, are ours: F_i of such a step is that of the least feasible cell that it leaves.
 
 Two ways lead to the same numbers. The *reference* cuts every patch with `sample_patches`, as
 training does. The *fast* way turns the loop inside out: seen from all cells at once, one point of
@@ -26,14 +27,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fgtutor import directions, patches
+from fgtutor import patches
+from fgtutor.directions import HeadingCount, Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, ThresholdError
 from fgtutor.feasibility import TAU_HIGH, TAU_LOW, calibrated_taus, ood_weight
 from fgtutor.grid import point_text
 from fgtutor.io.machine import require_memory
 from fgtutor.io.progress import watch
-from fgtutor.settings import Taus, Unknown
+from fgtutor.settings import HEADINGS, Taus, Unknown
 
 if TYPE_CHECKING:
     from fgtutor.specialist import Specialist
@@ -48,9 +50,9 @@ STRIP_CELLS = 2048
 class Assessment:
     """What one specialist says about every cell and heading of a map."""
 
-    f: Float[Tensor, "nx ny 8"]
+    f: Float[Tensor, "nx ny d"]
     """Feasibility f, the predicted r_v in [0, 1]."""
-    reconstruction: Float[Tensor, "nx ny 8"]
+    reconstruction: Float[Tensor, "nx ny d"]
     """L_recon, summed over the patch in the units the VAE sees (metres times `height_scale`)."""
     elevation: ElevationMap
     """The map that was assessed."""
@@ -59,8 +61,13 @@ class Assessment:
     specialist: Specialist | None = None
     """Whose assessment it is; None for numbers made by hand."""
 
+    @property
+    def headings(self) -> Headings:
+        """What the last axis counts."""
+        return Headings.of(self.f)
+
     def ood(self, tau_low: float | None = None, tau_high: float | None = None) -> Tensor:
-        """Return w_ood (Eq. 4), [nx, ny, 8], by `taus` unless thresholds are given."""
+        """Return w_ood (Eq. 4), [nx, ny, d], by `taus` unless thresholds are given."""
         low, high = self.taus
         low, high = low if tau_low is None else tau_low, high if tau_high is None else tau_high
         return ood_weight(self.reconstruction, low, high)
@@ -71,11 +78,12 @@ class Assessment:
         tau_high: float | None = None,
         *,
         unknown: Unknown = "block",
-    ) -> Float[Tensor, "nx ny 8"]:
+    ) -> Float[Tensor, "nx ny d"]:
         """Return F_i = w_ood * f (Eq. 5), by `taus` unless thresholds are given.
 
-        It is 0 where a step would start from or end on an unknown cell, or leave the map;
-        `unknown="fill"` trusts the filled heights instead.
+        Of a step over several cells it is the least of theirs. It is 0 where a step would start
+        from, pass through or end on an unknown cell, or leave the map; `unknown="fill"` trusts the
+        filled heights instead.
         """
         return self.weigh(tau_low, tau_high, unknown=unknown)[1]
 
@@ -85,15 +93,23 @@ class Assessment:
         tau_high: float | None = None,
         *,
         unknown: Unknown = "block",
-    ) -> tuple[Float[Tensor, "nx ny 8"], Float[Tensor, "nx ny 8"]]:
+    ) -> tuple[Float[Tensor, "nx ny d"], Float[Tensor, "nx ny d"]]:
         """Return w_ood and F_i, as `ood` and `weighted` do, computing w_ood once."""
         w_ood = self.ood(tau_low, tau_high)
         weighted = w_ood * self.f
-        return w_ood, self.closed(weighted) if unknown == "block" else weighted
+        return w_ood, self.closed(weighted) if unknown == "block" else self._least(weighted)
 
-    def closed(self, values: Float[Tensor, "nx ny 8"]) -> Float[Tensor, "nx ny 8"]:
-        """Return `values`, 0 for steps from or to an unknown cell or off the map."""
-        return values * torch.from_numpy(self.elevation.known_steps)
+    def closed(self, values: Float[Tensor, "nx ny d"]) -> Float[Tensor, "nx ny d"]:
+        """Return what holds for whole steps, if `values` hold for leaving cells.
+
+        It is the least value of the cells that a step leaves, and 0 for steps from, over or to an
+        unknown cell or off the map.
+        """
+        within = self.headings.steps_within(self.elevation.known)
+        return self._least(values) * torch.from_numpy(within)
+
+    def _least(self, values: Float[Tensor, "nx ny d"]) -> Float[Tensor, "nx ny d"]:
+        return torch.from_numpy(self.headings.least(values.numpy()))
 
 
 def tensorize(
@@ -101,14 +117,16 @@ def tensorize(
     specialist: Specialist,
     *,
     taus: Taus = "calibrated",
+    headings: HeadingCount = HEADINGS,
     method: Method = "auto",
     unknown: Unknown = "block",
     progress: bool = False,
-) -> Float[Tensor, "nx ny 8"]:
+) -> Float[Tensor, "nx ny d"]:
     """Return F_i(x, y, k) = w_ood * f: how well this specialist leaves a cell along heading k.
 
-    `taus` is "calibrated" (the specialist's own), "paper" or a pair (low, high), `unknown` as in
-    `Assessment.weighted`, `progress` shows a bar if it takes long.
+    `headings` is their number: 8, 16 or 32. `taus` is "calibrated" (the specialist's own), "paper"
+    or a pair (low, high), `unknown` as in `Assessment.weighted`, `progress` shows a bar if it takes
+    long.
 
     Raises:
         ThresholdError, ConfigError: A setting has a value without meaning.
@@ -116,7 +134,8 @@ def tensorize(
     """
     if unknown not in get_args(Unknown):
         raise ConfigError(f"unknown must be one of {', '.join(get_args(Unknown))}, got {unknown!r}")
-    assessment = assess(elevation, specialist, method, taus=taus, progress=progress)
+    options = {"taus": taus, "headings": headings, "progress": progress}
+    assessment = assess(elevation, specialist, method, **options)
     return assessment.weighted(unknown=unknown)
 
 
@@ -126,6 +145,7 @@ def assess(
     method: Method = "auto",
     *,
     taus: Taus = "calibrated",
+    headings: HeadingCount = HEADINGS,
     progress: bool = False,
 ) -> Assessment:
     """Return f and L_recon of every cell and heading; unknown cells are read as filled.
@@ -134,7 +154,7 @@ def assess(
     won on every map measured. Raises what `tensorize` raises.
     """
     team = {specialist.name: specialist}
-    said = assess_all(elevation, team, method, taus=taus, progress=progress)
+    said = assess_all(elevation, team, method, taus=taus, headings=headings, progress=progress)
     return said[specialist.name]
 
 
@@ -145,6 +165,7 @@ def assess_all(
     method: Method = "auto",
     *,
     taus: Taus = "calibrated",
+    headings: HeadingCount = HEADINGS,
     progress: bool = False,
 ) -> dict[str, Assessment]:
     """Return what each policy of `zoo` says; those with the same patch grid share its patches.
@@ -154,13 +175,13 @@ def assess_all(
     if method not in _WAYS:
         raise ConfigError(f"method must be one of {', '.join(_WAYS)}, got {method!r}")
     thresholds = {name: resolve_taus(taus, specialist) for name, specialist in zoo.items()}
-    nx, ny = elevation.shape
+    (nx, ny), yaws = elevation.shape, Headings(headings).yaws
     work = f"assessing {nx} x {ny} cells for {len(zoo)} polic{'y' if len(zoo) == 1 else 'ies'}"
     # f and L_recon in 4 bytes each, and one F_i.
-    needed = 4.0 * nx * ny * directions.NUM_HEADINGS * (2 * len(zoo) + 1)
+    needed = 4.0 * nx * ny * len(yaws) * (2 * len(zoo) + 1)
     require_memory(needed, work, "take a part of the map (ElevationMap.crop) or coarser cells")
     heights = patches.prepare(elevation).heights
-    blank = torch.empty(nx, ny, directions.NUM_HEADINGS)
+    blank = torch.empty(nx, ny, len(yaws))
     assessments = {
         name: Assessment(blank.clone(), blank.clone(), elevation, thresholds[name], specialist)
         for name, specialist in zoo.items()
@@ -169,10 +190,10 @@ def assess_all(
     tiles = (
         (grid, heading, rows, patch)
         for grid in grids
-        for heading, yaw in enumerate(directions.YAWS)
+        for heading, yaw in enumerate(yaws)
         for rows, patch in _WAYS[method](heights, yaw, grid, elevation.resolution)
     )
-    total = len(grids) * directions.NUM_HEADINGS * len(list(_strips(heights.shape)))
+    total = len(grids) * len(yaws) * len(list(_strips(heights.shape)))
     for grid, heading, rows, patch in watch(tiles, total, work, show=progress, unit="tile"):
         distinct, cells = _distinct(patch)
         for name, specialist in zoo.items():
@@ -218,7 +239,8 @@ def why_blocked(
     """
     if not assessments:
         raise ConfigError("without an assessment nothing is known of the map: give assess_all's")
-    elevation = next(iter(assessments.values())).elevation
+    first = next(iter(assessments.values()))
+    elevation, headings = first.elevation, first.headings
     place = f"{point_text((x, y), elevation.resolution)} m"
     if not elevation.contains(x, y):
         return f"{place} is off the map."
@@ -226,19 +248,18 @@ def why_blocked(
     where = f"Cell {cell} at {place}"
     if not elevation.known[cell]:
         return f"{where} is closed: it was never observed."
-    open_headings = np.flatnonzero(elevation.known_steps[cell])
+    open_headings = np.flatnonzero(headings.steps_within(elevation.known)[cell])
     if not len(open_headings):
         return f"{where} is closed: all its neighbours are unknown or off the map."
     reasons = []
     for name, assessment in assessments.items():
-        f, w_ood = assessment.f[cell][open_headings], assessment.ood()[cell][open_headings]
-        best = int((w_ood * f).argmax())
-        towards = directions.NAMES[open_headings[best]]
-        if w_ood[best] * f[best] >= f_min:
-            return (
-                f"{where} is open: {name} leaves it towards {towards} with "
-                f"F = {w_ood[best] * f[best]:.2f}."
-            )
+        # Of whole steps: what f or w_ood is worst at on the way closes the cell as well.
+        whole = assessment.closed(assessment.f), assessment.closed(assessment.ood())
+        F, f, w_ood = (values[cell][open_headings] for values in (assessment.weighted(), *whole))
+        best = int(F.argmax())
+        towards = headings.names[open_headings[best]]
+        if F[best] >= f_min:
+            return f"{where} is open: {name} leaves it towards {towards} with F = {F[best]:.2f}."
         if f.max() < f_min:
             reasons.append(f"{name} would not keep its velocity (f <= {f.max():.2f})")
         else:

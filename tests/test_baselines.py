@@ -166,7 +166,7 @@ def known(assessed):
     # Eq. 4 with tau 1 and 3: a loss of 2 lies half way.
     loss = {"gaps": torch.tensor(2.0), "steps": torch.tensor(0.0), "general": torch.tensor(0.0)}
     numbers = {name: by_hand(flat, f[name], loss[name]) for name in f}
-    return AssessedMap(flat, assessed.zoo, TAUS, numbers)
+    return AssessedMap(flat, assessed.zoo, TAUS, 8, numbers)
 
 
 def inner(layers, name):
@@ -214,7 +214,7 @@ def test_each_planner_drives_with_its_policies(known):
 def test_a_classical_map_refuses_what_a_specialist_crosses(known):
     elevation = wall(0.16, n=10)
     numbers = {"steps": by_hand(elevation, torch.tensor(0.8), torch.tensor(0.0))}
-    high = AssessedMap(elevation, known.zoo, TAUS, numbers)
+    high = AssessedMap(elevation, known.zoo, TAUS, 8, numbers)
     steps = partial(single, "steps")
     assert find_route(steps, high, (0.15, 0.5), (0.95, 0.5)).names == ("steps",)
     for cells in (traversability, occupancy):

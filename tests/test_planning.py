@@ -30,6 +30,7 @@ from fgtutor.planning import PAPER, PlanSettings, Refusal, Route, as_networkx, a
 
 BACKENDS = ("networkx", "scipy")
 RESOLUTION = 0.2
+EIGHT = directions.Headings(8)
 
 
 def flat(nx: int, ny: int, known: np.ndarray | None = None) -> ElevationMap:
@@ -355,7 +356,7 @@ def test_the_narrowed_search_finds_what_the_whole_one_does(seed, switch_cost, co
     for _ in range(seed % 3):
         tensors = (tensors + np.roll(tensors, 1, axis=1) + np.roll(tensors, 1, axis=2)) / 3
     grid = flat(30, 22)
-    layers = np.where(grid.known_steps & (tensors >= 0.2), tensors, 0)
+    layers = np.where(EIGHT.steps_within(grid.known) & (tensors >= 0.2), tensors, 0)
     search = Search(layers, switch_cost, cost, RESOLUTION)
     for start, goal in (((0, 0), (29, 21)), ((5, 15), (20, 3)), ((9, 9), (10, 9))):
         whole, distance = search._backwards(search._reversed(), start, goal)
@@ -471,6 +472,9 @@ def test_unknown_cells_are_never_silently_free(backend):
         ),
         ({"fused": np.ones((3, 4, 8))}, PlanningError, "expected shape"),
         ({"fused": np.full((3, 3, 8), np.nan)}, PlanningError, "NaN"),
+        ({"fused": np.ones((3, 3, 9))}, PlanningError, "8, 16 or 32"),
+        ({"fused": np.ones((3, 3, 16))}, PlanningError, r"policy_map: expected shape \(3, 3, 16"),
+        ({"headings": 12}, ConfigError, "headings: should be 8, 16 or 32"),
         ({"policy_map": np.full((3, 3, 8), 2), "names": ["a"]}, PlanningError, "names"),
         ({"policy_map": np.full((3, 3, 8), -1)}, PlanningError, "policies -1"),
     ],
@@ -536,7 +540,7 @@ def test_both_switching_graphs_cost_the_same_from_every_cell(seed, cost):
     tensors, grid, _, goal = random_problem(seed, policies=4)
     if seed % 2:
         tensors[1][tensors[0] > 0] = 0.6  # whatever 0 can, 1 can too
-    layers = np.where(grid.known_steps & (np.stack(tensors) >= 0.1), tensors, 0)
+    layers = np.where(EIGHT.steps_within(grid.known) & (np.stack(tensors) >= 0.1), tensors, 0)
     search = Search(layers, 0.7, cost, RESOLUTION)
     end = grid.cell_of(*goal)
     _, distance = search._backwards(search._reversed(), end, end)
@@ -551,7 +555,7 @@ def test_both_switching_graphs_cost_the_same_from_every_cell(seed, cost):
 
 
 def test_a_change_of_policy_takes_one_edge_where_the_old_one_can_take_every_step():
-    layers = np.ones((4, 30, 30, 8)) * flat(30, 30).known_steps
+    layers = np.ones((4, 30, 30, 8)) * EIGHT.steps_within(flat(30, 30).known)
     count = reversed_graph(layers, 1.0, "inverse", 0.1).nnz
     steps = np.count_nonzero(layers[0])
     assert count == 4 * steps + 4 * 3 * 900 and count < 0.4 * 4 * 4 * steps

@@ -54,7 +54,9 @@ def same(route, expected) -> bool:
 
 def test_the_two_settings_say_what_they_are():
     assert PlanSettings() == SETTINGS["ours"] and SETTINGS["paper"] == PAPER
-    assert str(PAPER) == "tau paper, f_min 0.1, cost inverse, switch cost 0, hysteresis of 1 steps"
+    assert str(PAPER) == (
+        "tau paper, 8 headings, f_min 0.1, cost inverse, switch cost 0, hysteresis of 1 steps"
+    )
     assert str(PlanSettings(taus=(0.2, 1.5))).startswith("tau 0.2 to 1.5, ")
     assert FollowConfig().hold_steps == PlanSettings().hold_steps
 
@@ -83,7 +85,8 @@ def test_single_options_change_one_thing():
 def test_stage_by_stage(asked, ground, zoo):
     name, expected = asked
     settings = SETTINGS[name]
-    tensors = [tensorize(ground.elevation, one, taus=settings.taus) for one in zoo.values()]
+    options = {"taus": settings.taus, "headings": settings.headings}
+    tensors = [tensorize(ground.elevation, one, **options) for one in zoo.values()]
     route = plan(
         *fuse(tensors),
         grid=ground.elevation,
@@ -99,9 +102,9 @@ def test_stage_by_stage(asked, ground, zoo):
 @pytest.mark.slow
 def test_as_the_tables_plan(asked, ground, zoo):
     name, expected = asked
-    ends = ground.start, ground.goal
-    assessed = AssessedMap(ground.elevation, zoo, SETTINGS[name].taus)
-    assert same(find_route(ours, assessed, *ends, SETTINGS[name]).raise_for().to_json(), expected)
+    ends, settings = (ground.start, ground.goal), SETTINGS[name]
+    assessed = AssessedMap(ground.elevation, zoo, settings.taus, settings.headings)
+    assert same(find_route(ours, assessed, *ends, settings).raise_for().to_json(), expected)
 
 
 @pytest.mark.slow

@@ -253,16 +253,6 @@ def test_no_step_leaves_the_map(make_specialist):
     assert not tensor[-1, :, 0].any() and not tensor[:, 0, 6].any()
 
 
-@given(st.integers(2, 5), st.integers(2, 5), st.integers(0, 2**16))
-def test_steps_within_cell_by_cell(nx, ny, seed):
-    known = np.random.default_rng(seed).random((nx, ny)) < 0.7
-    steps = directions.steps_within(known)
-    for ix, iy, heading in np.ndindex(nx, ny, 8):
-        x, y = np.array((ix, iy)) + directions.STEPS[heading]
-        there = 0 <= x < nx and 0 <= y < ny and known[x, y]
-        assert steps[ix, iy, heading] == (known[ix, iy] and there)
-
-
 def test_why_blocked_names_the_layer(make_specialist):
     elevation, specialist = with_hole(), make_specialist("steps")
 

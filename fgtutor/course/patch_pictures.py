@@ -1,6 +1,6 @@
 """Pictures of patches and of single headings: where a patch lies, what it shows, what F says there.
 
-Reads maps, poses, patches and tensors [nx, ny, 8]; gives matplotlib figures, as `figures.maps` does
+Reads maps, poses, patches and tensors [nx, ny, d]; gives matplotlib figures, as `figures.maps` does
 for whole maps.
 """
 
@@ -18,7 +18,8 @@ from matplotlib.patches import Polygon, Rectangle
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from fgtutor import directions, patches
+from fgtutor import patches
+from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.figures.maps import GROUND, draw_elevation
@@ -26,8 +27,6 @@ from fgtutor.figures.style import INK, TITLE, Panels, Picture
 from fgtutor.io.validation import check_arguments
 from fgtutor.patches import PatchGrid, sample_patches
 
-COMPASS = ((1, 2), (0, 2), (0, 1), (0, 0), (1, 0), (2, 0), (2, 1), (2, 2))
-"""Row and column of each heading in a 3 x 3 picture: +x on the right, +y above."""
 SMALL = {"fontsize": 8.5, "loc": "left"}
 """Titles of small panels."""
 
@@ -87,12 +86,13 @@ def patch_gallery(
 
 
 def patch_rose(elevation: ElevationMap, x: float, y: float, grid: PatchGrid) -> Picture:
-    """Draw the eight patches of one place, each at its side of the map's window around the place.
+    """Draw the patches of one place along eight headings, around the map's window at that place.
 
     Every patch is turned so that the robot looks to the right: this is what a network is shown.
     """
     figure = Picture(7.6, 6.2)
-    poses = np.column_stack((np.tile((x, y), (directions.NUM_HEADINGS, 1)), directions.YAWS))
+    headings = Headings(8)
+    poses = np.column_stack((np.tile((x, y), (headings.count, 1)), headings.yaws))
     shown = patch_at(elevation, poses, grid).numpy()
     reach = max(0.1, float(np.abs(shown).max()))
     around = 1.1 * patches.reach(grid)
@@ -101,6 +101,7 @@ def patch_rose(elevation: ElevationMap, x: float, y: float, grid: PatchGrid) -> 
         panels,
         lambda axes, heading: _patch(axes, shown[heading], grid, reach),
         elevation.crop(x - around, y - around, x + around, y + around),
+        headings,
         label="height (m)",
     )
     panels[1, 1].set(xticks=(), yticks=())
@@ -112,21 +113,23 @@ def patch_rose(elevation: ElevationMap, x: float, y: float, grid: PatchGrid) -> 
 
 
 def heading_maps(tensor: ArrayLike, grid: ElevationMap, *, label: str = "F") -> Picture:
-    """Draw the eight channels of a tensor [nx, ny, 8], each at the side that its heading points to.
+    """Draw the channels of a tensor [nx, ny, d], each at the side that its heading points to.
 
     In the middle lies the map.
     """
     values = np.asarray(tensor)
+    headings = Headings.of(values)
     width, height = grid.size
     figure = Picture(7.6, float(np.clip(7.0 * height / width, 2.0, 7.0)) + 0.8)
     x0, y0, x1, y1 = grid.extent
     _compass(
-        figure.subplots(3, 3, sharex=True, sharey=True),
+        figure.subplots(*[headings.count // 4 + 1] * 2, sharex=True, sharey=True),
         # An image is [row = y, column = x]: transpose, with its first row at the bottom.
         lambda axes, heading: axes.imshow(
             values[..., heading].T, origin="lower", extent=(x0, x1, y0, y1), vmin=0, vmax=1
         ),
         grid,
+        headings,
         label=label,
     )
     figure.suptitle(f"{label}: one map per heading", **TITLE, x=0.01)
@@ -137,18 +140,27 @@ def _compass(
     panels: np.ndarray,
     draw: Callable[[Axes, int], AxesImage],
     middle: ElevationMap,
+    headings: Headings,
     *,
     label: str,
 ) -> None:
     """Draw something for each heading at the side that it points to, and a map in the middle."""
     image = None
-    for heading, place in enumerate(COMPASS):
-        image = draw(panels[place], heading)
-        panels[place].set_title(f"heading {heading}: {directions.NAMES[heading]}", **SMALL)
-    figure = draw_elevation(middle, axes=panels[1, 1], bare=True)
-    panels[1, 1].set_title("the map", **SMALL)
+    # d headings surround a square: 8 one of 1 x 1 panels, 16 one of 3 x 3, 32 one of 7 x 7.
+    far = headings.count // 8
+    across, up = np.rint(far * headings.steps / headings.moves[:, None]).astype(int).T
+    around: list[Axes] = panels[far - up, far + across].tolist()  # rows count down, columns up
+    for heading, axes in enumerate(around):
+        image = draw(axes, heading)
+        axes.set_title(f"heading {heading}: {headings.names[heading]}", **SMALL)
+    inside: Axes = panels[far, far]
+    for axes in {*panels.flat} - {inside, *around}:
+        axes.remove()
+    inside.set_subplotspec(panels[0, 0].get_gridspec()[1:-1, 1:-1])
+    figure = draw_elevation(middle, axes=inside, bare=True)
+    inside.set_title("the map", **SMALL)
     if image is not None:
-        figure.colorbar(image, ax=list(panels.flat), shrink=0.6, pad=0.01, label=label)
+        figure.colorbar(image, ax=figure.axes, shrink=0.6, pad=0.01, label=label)
 
 
 def _span(grid: PatchGrid) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fgtutor.baselines import single
-from fgtutor.directions import NUM_HEADINGS
+from fgtutor.directions import HeadingCount, Headings
 from fgtutor.errors import TerrainError
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
@@ -36,6 +36,7 @@ from fgtutor.io.validation import Share as Fraction
 from fgtutor.planning import plan, plan_on_map
 from fgtutor.robots import ROBOTS
 from fgtutor.routes import Route
+from fgtutor.settings import HEADINGS
 from fgtutor.specialist import ZOO, Specialist
 from fgtutor.statistics import Share, spl
 from fgtutor.world.obstacles import Course
@@ -143,13 +144,14 @@ def _lay_flight(
         course.block(near, far, *y, float(top))
 
 
-def geodesic(terrain: Terrain) -> float:
+def geodesic(terrain: Terrain, headings: HeadingCount = HEADINGS) -> float:
     """Return the length of the shortest way from start to goal over cells that are no wall, m.
 
-    It goes from cell to cell in eight headings, as routes do: no route is shorter.
+    It goes from cell to cell along as many headings as routes do: no route is shorter.
     """
     open_ = terrain.elevation.heights < WALL - 1e-3
-    free = np.repeat(open_[..., None], NUM_HEADINGS, axis=-1).astype(float)
+    free = np.repeat(open_[..., None], headings, axis=-1).astype(float)
+    free = Headings(headings).least(free)
     start, goal = terrain.start, terrain.goal
     route = plan(free, 0 * free, grid=terrain.elevation, start=start, goal=goal)
     return route.raise_for().length
@@ -167,7 +169,7 @@ def way_of(xy: Float[np.ndarray, "n 2"], terrain: Terrain) -> str | None:
 
 def find_plans(
     terrain: Terrain, zoo: Mapping[str, Specialist], config: AdaptationConfig
-) -> dict[str, tuple[Float[Tensor, "nx ny 8"], Route | None]]:
+) -> dict[str, tuple[Float[Tensor, "nx ny d"], Route | None]]:
     """Return each checkpoint's tensor on a map and its route, None where there is no way for it."""
     ends, plans = (terrain.start, terrain.goal), {}
     for name, specialist in zoo.items():
@@ -194,7 +196,7 @@ class AdaptationRow(Outcome):
 def run_task(config: AdaptationConfig, index: int) -> list[AdaptationRow]:
     """Do one task: all trials of all checkpoints on one map."""
     terrain = make_map(config.robot, terrain_seed(config.seed, index), config.heights)
-    shortest = round(geodesic(terrain), 3)
+    shortest = round(geodesic(terrain, config.planning.headings), 3)
     ground, zoo = Ground(terrain=terrain, seeds=config.seeds(index)), config.load_checkpoints()
     planners = {name: partial(single, name) for name in zoo}
     return [
@@ -309,7 +311,7 @@ def run(config: AdaptationConfig) -> int:
             f"intervals; robot {config.robot}, {config.planning}, seed {config.seed}; "
             f"{config.told(config.condition)}. SPL against "
             f"the straight line of {STRAIGHT:g} m, as the paper's numbers imply, and against the "
-            f"shortest way over no wall, {geodesic(first):.1f} m.",
+            f"shortest way over no wall, {geodesic(first, config.planning.headings):.1f} m.",
             figures=figures(first, zoo, config) if config.out else {},
         )
 

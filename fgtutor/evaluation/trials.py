@@ -116,7 +116,8 @@ class Ground:
 
     def assess(self, zoo: Mapping[str, Specialist], settings: PlanSettings) -> AssessedMap:
         """Return what a zoo says of the map that planning sees."""
-        return AssessedMap(self.seen or self.terrain.elevation, zoo, settings.taus)
+        seen = self.seen or self.terrain.elevation
+        return AssessedMap(seen, zoo, settings.taus, settings.headings)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

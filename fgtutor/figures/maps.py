@@ -1,8 +1,8 @@
 """Pictures of everything between a map and a route, for notebooks, files and threads alike.
 
-Reads maps, tensors [nx, ny, 8] and plans; gives matplotlib figures that a notebook
+Reads maps, tensors [nx, ny, d] and plans; gives matplotlib figures that a notebook
 shows by themselves.
-Source: the quantities of the paper's Sec. III; the 8-petal glyphs are ours.
+Source: the quantities of the paper's Sec. III; the petal glyphs are ours.
 
 Arrays are [ix, iy], but an image has y first: the transposes are here and nowhere else.
 """
@@ -24,10 +24,10 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 from numpy.typing import ArrayLike
 
-from fgtutor import directions
+from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.figures.style import TITLE, Picture, policy_colours
+from fgtutor.figures.style import TITLE, Picture, heading_colours, policy_colours
 from fgtutor.io.validation import Count, check_arguments
 from fgtutor.routes import Route
 
@@ -35,10 +35,6 @@ if TYPE_CHECKING:
     from fgtutor.planning import Plan
     from fgtutor.world.terrain import Section
 
-HEADING_COLOURS = (
-    "#E69F00", "#B8A23A", "#009E73", "#56B4E9", "#0072B2", "#6F6DAE", "#CC79A7", "#D55E00",
-)  # fmt: skip
-"""One colour per heading, in a circle: neighbours resemble each other."""
 BLOCKED, UNKNOWN = "#33363B", "#C4C4C4"
 """Cells that no policy may leave, and cells that were never observed."""
 FEASIBLE, CLOSED = "#0072B2", "#D9D9D9"
@@ -153,7 +149,7 @@ def draw_petals(
     every: Count | None = None,
     axes: Axes | None = None,
 ) -> Figure:
-    """Draw a tensor F [nx, ny, 8] as one flower per cell: a petal's length is F along its heading.
+    """Draw a tensor F [nx, ny, d] as one flower per cell: a petal's length is F along its heading.
 
     With `policy_map` and `names` petals have the colour of the best policy, else of their heading.
     `every` draws every n-th cell along x and y, by default as few as can be told apart.
@@ -168,16 +164,18 @@ def draw_petals(
                                    indexing="ij"), axis=-1)  # fmt: skip
     f = tensor[at]
     open_ = f >= f_min
+    headings = Headings.of(tensor)
     # A petal along +x, from its stem to its tip and back; [point, (along, across)].
     along = np.array([0.0, 0.3, 0.65, 0.9, 1.0, 0.9, 0.65, 0.3])
     across = np.array([0.0, 0.11, 0.18, 0.12, 0.0, -0.12, -0.18, -0.11])
-    cos, sin = np.cos(directions.YAWS)[:, None], np.sin(directions.YAWS)[:, None]
+    across *= 8 / headings.count  # the more petals, the slimmer
+    cos, sin = np.cos(headings.yaws)[:, None], np.sin(headings.yaws)[:, None]
     shape = np.stack((along * cos - across * sin, along * sin + across * cos), axis=-1)
     radius = 0.56 * every * grid.resolution
     petals = centres[:, :, None, None] + f[..., None, None] * shape * radius
     if policy_map is None:
-        palette = np.array([to_rgb(colour) for colour in HEADING_COLOURS])
-        kind = np.broadcast_to(np.arange(directions.NUM_HEADINGS), f.shape)
+        palette = heading_colours(headings)
+        kind = np.broadcast_to(np.arange(headings.count), f.shape)
         caption = "One colour per heading"
     else:
         palette = _palette(names)
@@ -205,7 +203,7 @@ def draw_policy_map(
     axes: Axes | None = None,
     bare: bool = False,
 ) -> Figure:
-    """Draw P [nx, ny, 8]: in each cell the policy of its best heading, paler where F is low."""
+    """Draw P [nx, ny, d]: in each cell the policy of its best heading, paler where F is low."""
     axes = _stage(grid, axes)
     tensor, policies = _fit("F", fused, grid), _policies(policy_map, grid, names)
     best = tensor.argmax(axis=-1)[..., None]
@@ -268,7 +266,7 @@ def draw_plans(
     walls: Bool[np.ndarray, "nx ny"],
     places: Iterable[Section],
 ) -> Picture:
-    """Draw the same map once per plan, with its F [nx, ny, 8] and its route, side by side.
+    """Draw the same map once per plan, with its F [nx, ny, d] and its route, side by side.
 
     F is shown as its mean over the headings; a cell is closed where none reaches `f_min`.
     `places` are framed, and the height of what lies there is written below them.
@@ -295,7 +293,7 @@ def draw_plans(
         axes.set_title(f"{name}: {found}", **TITLE, loc="left")
     figure.suptitle(title, **TITLE, x=0.01)
     figure.supxlabel(
-        "in metres; blue: feasibility, mean of 8 headings; grey: closed; dark: wall; star: goal",
+        "in metres; blue: feasibility, mean of the headings; grey: closed; dark: wall; star: goal",
         fontsize=9,
     )
     return figure
@@ -378,10 +376,10 @@ def _hatch_unknown(axes: Axes, grid: ElevationMap) -> None:
     axes.add_collection(squares)
 
 
-def _fit(name: str, values: ArrayLike, grid: ElevationMap) -> Float[np.ndarray, "nx ny 8"]:
+def _fit(name: str, values: ArrayLike, grid: ElevationMap) -> Float[np.ndarray, "nx ny d"]:
     """Return a tensor in numpy; raises `ConfigError` if it is not of this map."""
     array = np.asarray(values)
-    shape = (*grid.shape, directions.NUM_HEADINGS)
+    shape = (*grid.shape, *array.shape[-1:])
     if array.shape != shape:
         raise ConfigError(f"{name} has shape {array.shape}, its map asks for {shape}")
     return array

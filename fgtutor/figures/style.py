@@ -9,10 +9,14 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from annotated_types import Interval
+from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from fgtutor.directions import Headings
 from fgtutor.errors import ConfigError
 from fgtutor.io.storage import atomic_write
 from fgtutor.io.validation import check_arguments
@@ -28,6 +32,10 @@ POLICY_COLOURS = {
     "ours": "#332288",
 }
 """A policy has one colour in the whole course: Okabe and Ito's, safe for the colour-blind."""
+HEADING_COLOURS = (
+    "#E69F00", "#B8A23A", "#009E73", "#56B4E9", "#0072B2", "#6F6DAE", "#CC79A7", "#D55E00",
+)  # fmt: skip
+"""One colour per 45 degrees, in a circle: neighbours resemble each other."""
 OTHER_COLOURS = ("#882255", "#999933", "#44AA99", "#F0E442")
 """Policies that the course does not know take these in turn: Paul Tol's muted ones and a yellow."""
 LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -77,6 +85,12 @@ def policy_colours(names: Sequence[str]) -> dict[str, str]:
     unknown = [name for name in names if name not in POLICY_COLOURS]
     others = {name: OTHER_COLOURS[i % len(OTHER_COLOURS)] for i, name in enumerate(unknown)}
     return {name: POLICY_COLOURS.get(name) or others[name] for name in names}
+
+
+def heading_colours(headings: Headings) -> Float[np.ndarray, "d 3"]:
+    """Return the colour of each heading, red, green and blue; between two it is a mixture."""
+    circle, at = np.array([to_rgb(colour) for colour in HEADING_COLOURS]), headings.yaws / np.pi * 4
+    return np.stack([np.interp(at, range(8), part, period=8) for part in circle.T], axis=-1)
 
 
 def colours_of(names: Iterable[str]) -> list[str]:

@@ -224,7 +224,7 @@ heading_maps(F, big, label="F of the steps specialist")
 # another side: those are the steps that would lead into the unknown.
 
 # %%
-closed = ~big.known_steps
+closed = ~directions.Headings.of(F).steps_within(big.known)
 print(f"steps closed since they leave known ground: {closed.sum():,} of {closed.size:,}")
 
 # %% [markdown]

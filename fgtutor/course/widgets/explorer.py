@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from fgtutor import directions
 from fgtutor.course.widgets.panels import Cell, Point, cell_table, check_cell
+from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.feasibility import TAU_HIGH, TAU_LOW
@@ -65,16 +65,20 @@ class Explorer:
         self.elevation, self.names = elevation, tuple(zoo)
         given = {name: one for name, one in zoo.items() if isinstance(one, Assessment)}
         asked = {name: one for name, one in zoo.items() if not isinstance(one, Assessment)}
-        known = given | assess_all(elevation, asked)
+        settings = settings or PlanSettings()
+        if given:  # they hold what was asked of them
+            headings = next(iter(given.values())).headings
+            settings = replace(settings, headings=headings.count)
+        known = given | assess_all(elevation, asked, headings=settings.headings)
         self.assessments = {name: known[name] for name in zoo}
-        shape = (*elevation.shape, directions.NUM_HEADINGS)
+        shape = (*elevation.shape, settings.headings)
         for name, one in self.assessments.items():
             if one.f.shape != shape:
                 raise ConfigError(
                     f"the assessment of {name!r} has shape {tuple(one.f.shape)}, the map asks for "
                     f"{shape}: assess and explore the same map"
                 )
-        self.settings, self.policies = settings or PlanSettings(), self.names
+        self.settings, self.policies = settings, self.names
         self.start, self.goal = start, goal
         self.update(**changes)
 
@@ -97,6 +101,11 @@ class Explorer:
             OffMapError: Start or goal is off the map.
         """
         settings = replace(self.settings, **changes)
+        if settings.headings != self.settings.headings:
+            raise ConfigError(
+                f"the map was assessed along {self.settings.headings} headings, not "
+                f"{settings.headings}: make another Explorer"
+            )
         start, goal = start or self.start, goal or self.goal
         policies = self.policies if policies is None else tuple(policies)
         unknown = [name for name in policies if name not in self.names]
@@ -143,7 +152,7 @@ class Explorer:
         route = self.plan.answer
         if isinstance(route, Refusal):
             return f"tau {shown}: No route: {route.reason}"
-        metres = directions.STEP_LENGTHS[route.headings] * self.elevation.resolution
+        metres = np.hypot(*np.diff(route.xy, axis=0).T)
         drives = ", ".join(
             f"{self.names[i]} {metres[route.policies == i].sum():.1f} m"
             for i in np.unique(route.policies).tolist()
@@ -164,7 +173,7 @@ class Explorer:
             "F_max": self.plan.fused[cell].tolist(),
             "P": [self.names[i] for i in self.plan.policy_map[cell].tolist()],
         }
-        return cell_table(self.elevation, cell, rows)
+        return cell_table(self.elevation, cell, Headings(self.settings.headings), rows)
 
 
 def _thresholds(settings: PlanSettings, assessment: Assessment) -> tuple[float, float]:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from fgtutor import directions
 from fgtutor.course.widgets.driving import Drive, Render
 from fgtutor.course.widgets.explorer import Explorer
 from fgtutor.course.widgets.painting import Painting
@@ -221,8 +220,9 @@ class TerrainPainter(_Board):
         self.painting = Painting(elevation, specialist, taus=taus, f_min=f_min)
         self.height = _slider(0.15, -0.6, 0.6, 0.01, "height (m)")
         self.radius = _slider(0.2, 0.0, 1.0, 0.05, "brush radius (m)")
+        names = self.painting.assessment.headings.names
         self.heading = w.Dropdown(
-            options=[("best", None), *((name, k) for k, name in enumerate(directions.NAMES))],
+            options=[("best", None), *((name, k) for k, name in enumerate(names))],
             description="F along heading",
             style=WIDE,
         )

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import find_objects
 
-from fgtutor import directions, patches
+from fgtutor import patches
 from fgtutor.course.widgets.panels import (
     Cell,
     Panel,
@@ -134,13 +134,16 @@ class Painting:
         """One line: how much of the map is open, and what the last stroke cost."""
         nx, ny = self.elevation.shape
         open_ = (self.shown >= self.f_min).mean()
-        way = "some heading" if self.heading is None else directions.NAMES[self.heading]
-        said = f"{open_:.0%} of the cells can be left towards {way}"
+        said = f"{open_:.0%} of the cells can be left towards {self._way('some heading')}"
         if self.window is not None:
             ix, iy = self.window
             cells = (ix.stop - ix.start) * (iy.stop - iy.start)
             said += f"; the last stroke computed {cells} of {nx * ny} cells anew"
         return said
+
+    def _way(self, otherwise: str) -> str:
+        """Name the chosen heading."""
+        return otherwise if self.heading is None else self.assessment.headings.names[self.heading]
 
     def read(self, cell: Cell) -> str:
         """Return a cell's numbers; raises `ConfigError` off the map."""
@@ -151,12 +154,11 @@ class Painting:
             "f": assessment.f, "L_recon": assessment.reconstruction, "w_ood": w_ood, "F": F
         }  # fmt: skip
         rows = {label: tensor[cell].tolist() for label, tensor in tensors.items()}
-        return cell_table(self.elevation, cell, rows)
+        return cell_table(self.elevation, cell, assessment.headings, rows)
 
     def scene(self) -> Scene:
         """Draw M and F side by side, the window of the last stroke outlined."""
         name, ny = self.specialist.name, self.elevation.shape[1]
-        way = "best heading" if self.heading is None else directions.NAMES[self.heading]
         box = None
         if self.window is not None:
             ix, iy = self.window
@@ -169,7 +171,7 @@ class Painting:
                     ),
                     Panel(
                         key="F",
-                        title=f"F of {name}, {way}",
+                        title=f"F of {name}, {self._way('best heading')}",
                         caption="yellow: feasible; dark: closed; the frame: computed anew",
                         colour=policy_colours([name])[name],
                     ),

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from matplotlib.colors import to_rgb
 
-from fgtutor import directions
+from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.figures.maps import BLOCKED, UNKNOWN, relief
@@ -100,14 +100,23 @@ def check_cell(elevation: ElevationMap, cell: Cell) -> None:
 
 
 def cell_table(
-    elevation: ElevationMap, cell: Cell, rows: Mapping[str, Sequence[float] | Sequence[str]]
+    elevation: ElevationMap,
+    cell: Cell,
+    headings: Headings,
+    rows: Mapping[str, Sequence[float] | Sequence[str]],
 ) -> str:
-    """Say where a cell is and how high, then eight values by heading for each label of `rows`."""
+    """Say where a cell is and how high, then a value per heading for each label of `rows`.
+
+    Eight headings stand side by side, further ones below.
+    """
     x, y = elevation.centre_of(*cell)
     height = f"height {elevation.heights[cell]:.2f} m"
     known = height if elevation.known[cell] else "never observed: closed"
     lines = [f"cell ({cell[0]}, {cell[1]})   x {x:.2f} m, y {y:.2f} m, {known}"]
-    for label, values in {"heading": directions.NAMES, **rows}.items():
-        texts = [value[:7] if isinstance(value, str) else f"{value:.2f}" for value in values]
-        lines.append(f"{label:<11.11}" + "".join(f"{text:>8}" for text in texts))
+    table = {"heading": headings.names, **rows}
+    for first in range(0, headings.count, 8):
+        for label, values in table.items():
+            some = values[first : first + 8]
+            texts = [value[:7] if isinstance(value, str) else f"{value:.2f}" for value in some]
+            lines.append(f"{label:<11.11}" + "".join(f"{text:>8}" for text in texts))
     return "\n".join(lines)
