@@ -78,7 +78,7 @@ def test_strength_scales_both_gains_and_the_rate_gain_one():
 
 
 def test_ranges_are_filled_and_small_dampings_are_more_frequent():
-    env = make(200, base=WIDE)
+    env = make(200, base=WIDE, calm_share=0.0)
     damping = env.physics.parameter("dof_damping")[:, 8] - 0.01
     assert 0 <= damping.min() < 0.01 and 1.8 < damping.max() <= 2.0
     assert damping.median() == pytest.approx(0.5, abs=0.2)  # 2 u^2 at u = 1/2
@@ -216,6 +216,21 @@ def test_noise_is_scaled():
     off = (loud.get_observations()["policy"] - clean.get_observations()["policy"]).abs()
     assert 0.018 < off[:, 9:21].max() <= 0.02 + 1e-6
     assert 0.14 < off[:, -135:].max() <= 0.15 + 1e-6
+
+
+def test_calm_robots_are_undisturbed_among_others():
+    loud = {"encoder_offset": 0.02, "scan_shift": 0.05, "push_speed": 3.0, "push_seconds": 0.02}
+    env = make(60, base=WIDE, calm_share=0.5, noise_share=1.0, **loud)
+    clean = make(60)
+    calm = env.senses.share[:, 0] == 0
+    assert 15 < calm.sum() < 45
+    assert not env.traits[calm].any() and env.traits[~calm].any(dim=1).all()
+    for _ in range(3):
+        a, b = (e.get_observations()["policy"][:, 3:] for e in (env, clean))
+        assert torch.allclose(a[calm], b[calm], atol=1e-4)
+        assert ((a - b)[~calm].abs().amax(dim=1) > 0.01).all()
+        env.step(torch.zeros(60, 12))
+        clean.step(torch.zeros(60, 12))
 
 
 def test_ranges_that_make_no_sense_are_refused():

@@ -129,7 +129,7 @@ class A1Env(LocomotionEnv):
         self.exploded = torch.zeros(num_envs, dtype=torch.bool)
         self.explosions = 0
         self.senses = Senses(self.settings, num_envs, self.control_dt, self.uniform, device)
-        self.late, self.traits = Bodies.alike(num_envs)
+        self.late, _, self.traits = Bodies.alike(num_envs)
         self.body_seed = seed
         self._randomise()
         self.reset_all()
@@ -140,7 +140,8 @@ class A1Env(LocomotionEnv):
         """Make every simulation another robot on another ground, once for all its episodes."""
         if self.settings.randomise:
             bodies = randomise(self.physics, self.settings, self.body_seed)
-            self.late, self.traits = (value.to(self.device) for value in bodies)
+            self.late, calm, self.traits = (value.to(self.device) for value in bodies)
+            self.senses.share = (~calm).float()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what training must store to continue, and which robots it had drawn."""
@@ -180,7 +181,8 @@ class A1Env(LocomotionEnv):
         hit = self.uniform(self.num_envs) < self.control_dt / self.settings.push_seconds
         if hit.any():
             shove = self.settings.push_speed * (2 * self.uniform(self.num_envs, 2) - 1)
-            self.physics.qvel[:, :2] += (shove * hit[:, None]).double().cpu()
+            shove = self.senses.share * shove * hit[:, None]
+            self.physics.qvel[:, :2] += shove.double().cpu()
 
     def _count_explosions(self, broken: Bool[Tensor, "envs"]) -> None:
         """Mark simulations whose numbers blew up, or whose actions were not numbers, as lost.
@@ -273,7 +275,7 @@ class A1Env(LocomotionEnv):
             dim=-1,
         )
         if self.settings.noise:
-            features += self.noise * (2 * self.uniform(*features.shape) - 1)
+            features += self.senses.share * self.noise * (2 * self.uniform(*features.shape) - 1)
         # What is about to explode must not reach the learner either.
         return (features * self.scale).clamp(-20.0, 20.0)
 
@@ -310,7 +312,8 @@ class A1Env(LocomotionEnv):
         trunk = self.pose[:, 2:3] + self.senses.scan[:, 2:]
         heights = self.look[:, -rows:, side : side + columns].flatten(1) - trunk
         if self.settings.noise:
-            heights += self.settings.scan_noise * (2 * self.uniform(*heights.shape) - 1)
+            noise = self.senses.share * self.settings.scan_noise
+            heights += noise * (2 * self.uniform(*heights.shape) - 1)
         return SCAN_SCALE * (heights.clamp(-SCAN_LIMIT, SCAN_LIMIT) + STANCE_HEIGHT)
 
     def fallen(self) -> Bool[Tensor, "envs"]:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fgtutor.io.validation import Ascending, NonNegative, Share, check_fields
-from fgtutor.robots.a1.model import LEGS
+from fgtutor.robots.a1.model import LEGS, A1Config
 from fgtutor.robots.a1.observation import SCAN_NOISE
 from fgtutor.robots.a1.physics import Physics
 from fgtutor.robots.a1.rewards import RewardWeights
@@ -70,6 +70,8 @@ class A1EnvConfig:
     """Largest change of the trunk's velocity by a push, along x and y, m/s."""
     push_seconds: Annotated[float, Interval(gt=0, le=3600)] = 8.0
     """Mean time between two pushes, s."""
+    calm_share: Share = 0.0
+    """Share of robots that meet none of this: the model itself, without noise, errors or pushes."""
     strength: Annotated[tuple[Factor, Factor], Ascending] = (1.0, 1.0)
     """Range of the motors' strength: a factor on stiffness, damping and greatest torque."""
     rate_gain: Annotated[tuple[Factor, Factor], Ascending] = (1.0, 1.0)
@@ -135,6 +137,7 @@ DISTURBED = A1EnvConfig(
 )
 """What evaluation calls disturbed."""
 WIDE = A1EnvConfig(
+    calm_share=0.3,
     friction=(0.3, 1.25),
     payload=(-1.0, 3.0),
     centre_shift=0.04,
@@ -156,7 +159,8 @@ WIDE = A1EnvConfig(
     tilt_offset=0.03,
     gyro_offset=0.05,
 )
-"""What policies that shall hold under `DISTURBED`, and on other models, are trained under."""
+"""What policies that shall hold under `DISTURBED`, and on other models, are trained under. Calm
+robots keep them good at what is ideal, and what is promised there true."""
 
 
 class Bodies(NamedTuple):
@@ -164,6 +168,8 @@ class Bodies(NamedTuple):
 
     late: Bool[Tensor, "sims 1"]
     """Which act one control step late."""
+    calm: Bool[Tensor, "sims 1"]
+    """Which nothing disturbs."""
     traits: Float[Tensor, "sims 7"]
     """What only a critic may know, about -1 to 1 each, 0 for the model itself: friction, payload,
     strength, D gain, joint damping, dry friction and delay."""
@@ -172,7 +178,7 @@ class Bodies(NamedTuple):
     def alike(cls, n: int) -> "Bodies":
         """Return `n` robots that do not differ."""
         late = torch.zeros(n, 1, dtype=torch.bool)
-        return cls(late, torch.zeros(n, 7))
+        return cls(late, ~late, torch.zeros(n, 7))
 
 
 def delayable(spec: Any, longest: float) -> None:
@@ -194,15 +200,8 @@ def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bodies:
         return low + (high - low) * torch.rand(n, *shape, generator=rng, dtype=torch.float64)
 
     trunk, own = physics.model.body("trunk"), physics.model
-    friction = draw(*s.friction, 1)
-    _set_friction(physics, friction)
-    load = draw(*s.payload, 1) + trunk.mass.item()
-    physics.parameter("body_mass")[:, trunk.id] = load[:, 0]
-    inertia = torch.tensor(trunk.inertia) / trunk.mass.item()
-    physics.parameter("body_inertia")[:, trunk.id] = inertia * load
-    centre = torch.tensor(trunk.ipos) + draw(-s.centre_shift, s.centre_shift, 3)
-    physics.parameter("body_ipos")[:, trunk.id] = centre
-    # MuJoCo writes a position controller as gain[0] * ctrl + bias[1] * q + bias[2] * dq/dt.
+    friction, payload = draw(*s.friction, 1), draw(*s.payload, 1)
+    shift = draw(-s.centre_shift, s.centre_shift, 3)
     stiffness, damping = (draw(1 - s.gain_share, 1 + s.gain_share, 1) for _ in range(2))
     late = draw(0.0, 1.0, 1) < s.delayed_share
     strength, rate_gain, delay = draw(*s.strength, 1), draw(*s.rate_gain, 1), draw(*s.delay, 1)
@@ -210,6 +209,19 @@ def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bodies:
         low + (high - low) * draw(0.0, 1.0, 1).square()
         for low, high in (s.joint_damping, s.dry_friction)
     )
+    calm = draw(0.0, 1.0, 1) < s.calm_share
+    for value in (payload, shift, late, delay, passive, dry):
+        value.masked_fill_(calm, 0)
+    for value in (stiffness, damping, strength, rate_gain):
+        value.masked_fill_(calm, 1)
+    friction.masked_fill_(calm, A1Config.friction)
+    _set_friction(physics, friction)
+    load = payload + trunk.mass.item()
+    physics.parameter("body_mass")[:, trunk.id] = load[:, 0]
+    inertia = torch.tensor(trunk.inertia) / trunk.mass.item()
+    physics.parameter("body_inertia")[:, trunk.id] = inertia * load
+    physics.parameter("body_ipos")[:, trunk.id] = torch.tensor(trunk.ipos) + shift
+    # MuJoCo writes a position controller as gain[0] * ctrl + bias[1] * q + bias[2] * dq/dt.
     gain, bias = physics.parameter("actuator_gainprm"), physics.parameter("actuator_biasprm")
     gain[:, :, 0] = torch.tensor(own.actuator_gainprm[:, 0]) * stiffness * strength
     bias[:, :, 1] = torch.tensor(own.actuator_biasprm[:, 1]) * stiffness * strength
@@ -224,11 +236,11 @@ def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bodies:
         step = own.opt.timestep
         physics.parameter("actuator_delay")[:] = step * (delay / step).round()
     physics.set_const()
-    differs = (friction - 0.8, load - trunk.mass.item(), strength - 1, rate_gain - 1, passive)
+    differs = (friction - A1Config.friction, payload, strength - 1, rate_gain - 1, passive)
     scales = (2.0, 0.3, 5.0, 1.0, 0.5)
     traits = [value * scale for value, scale in zip(differs, scales, strict=True)]
     traits = torch.cat((*traits, 3.0 * dry, 25.0 * delay), dim=-1).float()
-    return Bodies(late, traits)
+    return Bodies(late, calm, traits)
 
 
 def _set_friction(physics: Physics, friction: Float[Tensor, "sims 1"]) -> None:

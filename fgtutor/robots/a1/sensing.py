@@ -37,6 +37,7 @@ class Senses:
     """The errors of a batch of robots, and what their legs say.
 
     Attributes:
+        share: By how much each robot is in error [envs, 1]: 0 for a calm one, 1 for any other.
         encoder: Error of each joint's zero [envs, 12], rad.
         gyro: Error of the rotation rates [envs, 3], rad/s.
         tilt: Error of the direction of gravity, as a rotation vector [envs, 3], rad.
@@ -55,6 +56,7 @@ class Senses:
     ) -> None:
         """Begin without errors; `uniform` draws numbers in [0, 1) of a given shape."""
         self.settings, self.dt, self._uniform = settings, control_dt, uniform
+        self.share = torch.ones(num_envs, 1, device=device)
         self.encoder = torch.zeros(num_envs, 12, device=device)
         self.gyro, self.tilt, self.scan, self.velocity = torch.zeros(4, num_envs, 3, device=device)
         s = settings
@@ -81,7 +83,7 @@ class Senses:
         self.velocity[ids] = 0.0
         self.scan[ids] = 0.0
         for value, largest in self._drawn:
-            value[ids] = largest * self._signed(len(ids), value.shape[1])
+            value[ids] = self.share[ids] * largest * self._signed(len(ids), value.shape[1])
 
     def advance(
         self,
@@ -103,11 +105,12 @@ class Senses:
         s = self.settings
         if s.scan_drift:
             step = math.sqrt(3 * self.dt) * s.scan_drift
-            self.scan += step * self._signed(*self.scan.shape)
+            self.scan += self.share * step * self._signed(*self.scan.shape)
         if s.velocity == "error":
             kept = math.exp(-self.dt / s.velocity_seconds)
             kick = math.sqrt(3 * (1 - kept**2)) * s.velocity_error
-            self.velocity = kept * self.velocity + kick * self._signed(*self.velocity.shape)
+            kicks = self.share * kick * self._signed(*self.velocity.shape)
+            self.velocity = kept * self.velocity + kicks
         elif s.velocity == "odometry":
             joints = self._measured(joints + self.encoder, "joints")
             rates = self._measured(rates, "joint rates")
@@ -129,7 +132,8 @@ class Senses:
         """Add the noise of a kind of sensor, if there is noise."""
         if not self.settings.noise:
             return value
-        return value + self.settings.noise_share * NOISE[kind][1] * self._signed(*value.shape)
+        noise = self.share * self.settings.noise_share * NOISE[kind][1]
+        return value + noise * self._signed(*value.shape)
 
     def _signed(self, *shape: int) -> Tensor:
         """Draw numbers in [-1, 1)."""
