@@ -5,26 +5,20 @@ gives f, L_recon and F_i = w_ood * f, all [nx, ny, d].
 Source: paper, Sec. III-B (Eqs. 4-5). Steps over cells between their ends, and so more than 8
 headings, are ours: F_i of such a step is that of the least feasible cell that it leaves.
 
-Two ways lead to the same numbers. The *reference* cuts every patch with `sample_patches`, as
-training does. The *fast* way turns the loop inside out: seen from all cells at once, one point of
-the patch is the whole map, shifted. So the network's first layer, a weighted sum of patch points,
-is a weighted sum of shifted maps: a convolution of M. It is evaluated as one matrix product per
-strip of the map, with a shifted strip as each row, so that memory stays flat. A convolution routine
-was no faster along the axes and slower along the diagonals, where the turned kernel has two to
-eight times more taps (at cells of 0.1 and 0.05 m) than the patch has points. Equal patches are
-assessed once.
+What is said of a tile of the map (`tiles`) depends, to the last bit, on nothing but the heights
+that its patches see. So a changed map costs only the tiles that see the change (`reassess`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fgtutor import patches
@@ -36,14 +30,10 @@ from fgtutor.grid import point_text
 from fgtutor.io.machine import require_memory
 from fgtutor.io.progress import watch
 from fgtutor.settings import HEADINGS, Taus, Unknown
+from fgtutor.tiles import WAYS, Method, Tile, cells_seeing, distinct_patches, tiles_of
 
 if TYPE_CHECKING:
     from fgtutor.specialist import Specialist
-
-Method = Literal["auto", "reference", "fast"]
-
-STRIP_CELLS = 2048
-"""Cells assessed at a time: 187 points of each are 1.5 MB. The speed hardly depends on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +101,25 @@ class Assessment:
     def _least(self, values: Float[Tensor, "nx ny d"]) -> Float[Tensor, "nx ny d"]:
         return torch.from_numpy(self.headings.least(values.numpy()))
 
+    def around(self, cell: tuple[int, int]) -> tuple[Assessment, tuple[int, int]]:
+        """Return the part that steps from a known cell lead over, and the place of the cell in it.
+
+        What is weighed there of the cell is what would be weighed on the whole map.
+        """
+        farthest = int(self.headings.moves.max())
+        first = ix, iy = max(cell[0] - farthest, 0), max(cell[1] - farthest, 0)
+        at = slice(ix, cell[0] + farthest + 1), slice(iy, cell[1] + farthest + 1)
+        x, y = (
+            corner + n * self.elevation.resolution
+            for corner, n in zip(self.elevation.origin, first, strict=True)
+        )
+        known, heights = self.elevation.known[at], self.elevation.heights[at]
+        elevation = replace(self.elevation, heights=heights, known=known, origin=(x, y))
+        part = replace(
+            self, f=self.f[at], reconstruction=self.reconstruction[at], elevation=elevation
+        )
+        return part, (cell[0] - ix, cell[1] - iy)
+
 
 def tensorize(
     elevation: ElevationMap,
@@ -172,8 +181,8 @@ def assess_all(
 
     The numbers are those of `assess`, in less time. Raises what `tensorize` raises.
     """
-    if method not in _WAYS:
-        raise ConfigError(f"method must be one of {', '.join(_WAYS)}, got {method!r}")
+    if method not in WAYS:
+        raise ConfigError(f"method must be one of {', '.join(WAYS)}, got {method!r}")
     thresholds = {name: resolve_taus(taus, specialist) for name, specialist in zoo.items()}
     (nx, ny), yaws = elevation.shape, Headings(headings).yaws
     work = f"assessing {nx} x {ny} cells for {len(zoo)} polic{'y' if len(zoo) == 1 else 'ies'}"
@@ -186,26 +195,89 @@ def assess_all(
         name: Assessment(blank.clone(), blank.clone(), elevation, thresholds[name], specialist)
         for name, specialist in zoo.items()
     }
-    grids = {specialist.grid for specialist in zoo.values()}
-    tiles = (
-        (grid, heading, rows, patch)
-        for grid in grids
+    tiles = dict.fromkeys((one.grid for one in zoo.values()), tiles_of(heights.shape))
+    _assess_tiles(zoo, heights, tiles, assessments, method, work if progress else None)
+    return assessments
+
+
+@torch.no_grad()
+def reassess(
+    assessments: Mapping[str, Assessment], elevation: ElevationMap
+) -> tuple[dict[str, Assessment], Bool[np.ndarray, "nx ny"]]:
+    """Return what `assess_all` says of a map with some heights changed, and which cells see them.
+
+    `assessments` are of the map before the change, by "auto" or "fast". The numbers are those of
+    `assess_all`, bit for bit, for the work of the tiles whose patches see a change. Preparing the
+    map is not local (an unknown cell takes the nearest known height, from any distance), but cheap:
+    the whole map is prepared, and what came out is compared.
+
+    Raises `ConfigError` without an assessment, for one without its specialist, for assessments of
+    several maps, and for a map of another shape or resolution.
+    """
+    zoo = {name: one.specialist for name, one in assessments.items() if one.specialist}
+    maps = {id(one.elevation): one.elevation for one in assessments.values()}
+    if len(maps) != 1 or len(zoo) < len(assessments):
+        raise ConfigError(
+            f"reassess needs assessments of one map with their specialists, got {len(assessments)} "
+            f"of {len(maps)} maps, {len(zoo)} with a specialist: give what assess_all returned"
+        )
+    (before,), headings = maps.values(), next(iter(assessments.values())).headings
+    if (before.shape, before.resolution) != (elevation.shape, elevation.resolution):
+        raise ConfigError(f"{elevation} is not {before} with other heights: assess it as a new map")
+    heights = patches.prepare(elevation).heights
+    # Compared bit by bit, so that -0 is not 0.
+    changed = patches.prepare(before).heights.view(np.int32) != heights.view(np.int32)
+    seen = {
+        grid: cells_seeing(changed, grid, headings, elevation.resolution)
+        for grid in {specialist.grid for specialist in zoo.values()}
+    }
+    tiles = {
+        grid: [tile for tile in tiles_of(elevation.shape) if cells[tile].any()]
+        for grid, cells in seen.items()
+    }
+    renewed = {
+        name: replace(
+            one, f=one.f.clone(), reconstruction=one.reconstruction.clone(), elevation=elevation
+        )
+        for name, one in assessments.items()
+    }
+    _assess_tiles(zoo, heights, tiles, renewed)
+    return renewed, np.logical_or.reduce([*seen.values()])
+
+
+def _assess_tiles(
+    zoo: Mapping[str, Specialist],
+    heights: Float[np.ndarray, "nx ny"],
+    tiles: Mapping[patches.PatchGrid, Sequence[Tile]],
+    assessments: Mapping[str, Assessment],
+    method: Method = "auto",
+    work: str | None = None,
+) -> None:
+    """Assess tiles of a prepared map, those of each patch grid, and write them into `assessments`.
+
+    `work` says what a progress bar stands for; None shows none.
+    """
+    resolution = next((one.elevation.resolution for one in assessments.values()), 1.0)
+    yaws = next((one.headings.yaws for one in assessments.values()), ())
+    cut = (
+        (grid, heading, tile, patch)
+        for grid, some in tiles.items()
         for heading, yaw in enumerate(yaws)
-        for rows, patch in _WAYS[method](heights, yaw, grid, elevation.resolution)
+        for tile, patch in WAYS[method](heights, yaw, grid, resolution, some)
     )
-    total = len(grids) * len(yaws) * len(list(_strips(heights.shape)))
-    for grid, heading, rows, patch in watch(tiles, total, work, show=progress, unit="tile"):
-        distinct, cells = _distinct(patch)
+    total = len(yaws) * sum(map(len, tiles.values()))
+    shown = watch(cut, total, work or "", show=work is not None, unit="tile")
+    for grid, heading, (rows, columns), patch in shown:
+        distinct, cells = distinct_patches(patch)
         for name, specialist in zoo.items():
             if specialist.grid != grid:
                 continue
             net, one = specialist.feasibility, assessments[name]
             command = torch.tensor(specialist.command, dtype=torch.float32)
             f = net.feasibility(distinct, command.expand(len(distinct), -1))
-            one.f[rows, :, heading] = f[cells].reshape(-1, ny)
-            loss = net.reconstruction(distinct)
-            one.reconstruction[rows, :, heading] = loss[cells].reshape(-1, ny)
-    return assessments
+            found = f, net.reconstruction(distinct)
+            for values, whole in zip(found, (one.f, one.reconstruction), strict=True):
+                whole[rows, columns, heading] = values[cells].reshape(rows.stop - rows.start, -1)
 
 
 def resolve_taus(taus: Taus, specialist: Specialist) -> tuple[float, float]:
@@ -248,14 +320,16 @@ def why_blocked(
     where = f"Cell {cell} at {place}"
     if not elevation.known[cell]:
         return f"{where} is closed: it was never observed."
-    open_headings = np.flatnonzero(headings.steps_within(elevation.known)[cell])
+    parts = {name: assessment.around(cell) for name, assessment in assessments.items()}
+    part, at = parts[next(iter(parts))]
+    open_headings = np.flatnonzero(headings.steps_within(part.elevation.known)[at])
     if not len(open_headings):
         return f"{where} is closed: all its neighbours are unknown or off the map."
     reasons = []
-    for name, assessment in assessments.items():
+    for name, (part, at) in parts.items():
         # Of whole steps: what f or w_ood is worst at on the way closes the cell as well.
-        whole = assessment.closed(assessment.f), assessment.closed(assessment.ood())
-        F, f, w_ood = (values[cell][open_headings] for values in (assessment.weighted(), *whole))
+        whole = part.closed(part.f), part.closed(part.ood())
+        F, f, w_ood = (values[at][open_headings] for values in (part.weighted(), *whole))
         best = int(F.argmax())
         towards = headings.names[open_headings[best]]
         if F[best] >= f_min:
@@ -268,64 +342,3 @@ def why_blocked(
                 f"but w_ood only {w_ood.max():.2f})"
             )
     return f"{where} is closed at f_min = {f_min:g}: {'; '.join(reasons)}."
-
-
-def _strips(shape: tuple[int, int]) -> Iterator[slice]:
-    """Cut the map's rows into strips of about `STRIP_CELLS` cells."""
-    rows = max(1, STRIP_CELLS // shape[1])
-    for start in range(0, shape[0], rows):
-        yield slice(start, min(start + rows, shape[0]))
-
-
-def _sampled(
-    heights: Float[np.ndarray, "nx ny"], yaw: float, grid: patches.PatchGrid, resolution: float
-) -> Iterator[tuple[slice, Float[Tensor, "cells points"]]]:
-    """Reference: cut the patch of every cell by itself."""
-    # Positions in float64: in float32, metres ten from the origin round off 1e-5 of a cell.
-    surface = torch.tensor(heights, dtype=torch.float64)
-    y = (torch.arange(heights.shape[1], dtype=torch.float64) + 0.5) * resolution
-    for rows in _strips(heights.shape):
-        x = (torch.arange(rows.start, rows.stop, dtype=torch.float64) + 0.5) * resolution
-        poses = torch.cartesian_prod(x, y, torch.tensor([yaw], dtype=torch.float64))
-        patch = patches.sample_patches(surface, poses, grid, resolution=resolution)
-        yield rows, patch.float()
-
-
-def _shifted(
-    heights: Float[np.ndarray, "nx ny"], yaw: float, grid: patches.PatchGrid, resolution: float
-) -> Iterator[tuple[slice, Float[Tensor, "cells points"]]]:
-    """Fast: one point of the patch, for all cells, is the map shifted by that point's offset."""
-    ny = heights.shape[1]
-    offsets = patches.rotate(grid.points.double(), torch.tensor(yaw)) / resolution
-    whole = offsets.floor().long()
-    a, b = (offsets - whole).float().T[..., None, None]
-    margin = int(whole.abs().max()) + 1
-    i, j = (whole + margin).T
-    surface = torch.from_numpy(np.pad(heights, margin, mode="edge"))
-    for rows in _strips(heights.shape):
-        strip = surface[rows.start : rows.stop + 2 * margin]
-        # Only height differences matter; small numbers keep float32 sharp on high ground.
-        strip = strip - strip.mean()
-        # A view, not a copy: shifted[i, j] is the strip moved by (i - margin, j - margin) cells.
-        shifted = strip.unfold(0, rows.stop - rows.start, 1).unfold(1, ny, 1)
-        # The bilinear rule of `sample_heights`: a shift by part of a cell blends its neighbours.
-        near = torch.lerp(shifted[i, j], shifted[i, j + 1], b)
-        far = torch.lerp(shifted[i + 1, j], shifted[i + 1, j + 1], b)
-        patch = torch.lerp(near, far, a).flatten(1).T
-        yield rows, patch - patches.ground_height(patch, grid)
-
-
-def _distinct(
-    patch: Float[Tensor, "cells points"],
-) -> tuple[Float[Tensor, "distinct points"], Int[Tensor, " cells"]]:
-    """Return each distinct patch once, and which of them every cell has.
-
-    Ground that was built repeats itself: of 2000 cells beside a step, 30 look different.
-    """
-    rows = np.ascontiguousarray(patch.numpy())
-    whole = rows.view(f"V{rows.strides[0]}").ravel()  # a row is compared as one run of bytes
-    _, first, cells = np.unique(whole, return_index=True, return_inverse=True)
-    return torch.from_numpy(rows[first]), torch.from_numpy(cells)
-
-
-_WAYS = {"auto": _shifted, "reference": _sampled, "fast": _shifted}

@@ -8,7 +8,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fgtutor import directions, patches, tensorization
+from fgtutor import directions, patches, tiles
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, ThresholdError, TooLargeError
 from fgtutor.io import machine, progress
@@ -59,10 +59,10 @@ def test_fast_equals_reference_on_any_small_map(make_specialist, nx, ny, seed):
 
 
 @pytest.mark.parametrize("method", ["fast", "reference"])
-def test_the_cut_into_strips_does_not_show(make_specialist, monkeypatch, method):
+def test_the_cut_into_tiles_does_not_show(make_specialist, monkeypatch, method):
     specialist, elevation = make_specialist(), rough(23, 17)
     whole = assess(elevation, specialist, method)
-    monkeypatch.setattr(tensorization, "STRIP_CELLS", 50)  # two rows a strip, the last one alone
+    monkeypatch.setattr(tiles, "TILE", 7)  # at the far borders less is left
     strips = assess(elevation, specialist, method)
     close(strips.f, whole.f, 1e-6)
     close(strips.reconstruction, whole.reconstruction, 1e-5)
@@ -288,7 +288,7 @@ def test_a_map_too_large_for_the_memory_left_is_refused(make_specialist, monkeyp
 
 def test_a_bar_and_the_expected_time_are_shown_where_asked(make_specialist, monkeypatch, capsys):
     team = {"a": make_specialist("a"), "b": make_specialist("b", grid=ASYMMETRIC)}
-    monkeypatch.setattr(tensorization, "STRIP_CELLS", 50)
+    monkeypatch.setattr(tiles, "TILE", 7)
     for name in ("QUICK", "TRIED", "LONG"):
         monkeypatch.setattr(progress, name, 0.0)
     assess_all(rough(15, 20), team)
@@ -296,8 +296,8 @@ def test_a_bar_and_the_expected_time_are_shown_where_asked(make_specialist, monk
     assess_all(rough(15, 20), team, progress=True)
     shown = capsys.readouterr().err
     assert re.search("assessing 15 x 20 cells for 2 policies: about [0-9]+ s\n", shown)
-    # Two rows per strip are 8 strips; with 8 headings and two grids 128 tiles.
-    assert "128/128" in shown
+    # 3 x 3 tiles, 8 headings and two grids.
+    assert "144/144" in shown
 
 
 def test_what_is_quick_shows_nothing(make_specialist, capsys):

@@ -1,7 +1,7 @@
 """Painting heights, and seeing which feasibilities follow: only those whose patch was touched.
 
 Reads a map and one specialist; gives f, L_recon and F of the painted map. A stroke assesses the
-window of cells that can have changed, not the map. Source: paper, Sec. III-B (a patch is local).
+tiles whose patches see it, not the map (`reassess`). Source: paper, Sec. III-B (a patch is local).
 """
 
 import math
@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import find_objects
 
-from fgtutor import patches
 from fgtutor.course.widgets.panels import (
     Cell,
     Panel,
@@ -25,7 +24,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.figures.style import policy_colours
 from fgtutor.specialist import Specialist
-from fgtutor.tensorization import Assessment, Taus, assess
+from fgtutor.tensorization import Assessment, Taus, assess, reassess
 
 Window = tuple[slice, slice]
 
@@ -57,16 +56,15 @@ class Painting:
         """Take back every stroke."""
         self.elevation = self._map(self._blank)
         """The map as painted so far."""
-        self._prepared = patches.prepare(self.elevation).heights
         self.assessment: Assessment = assess(self.elevation, self.specialist, taus=self._taus)
         """f and L_recon of the painted map."""
         self.window: Window | None = None
-        """The cells that the last stroke assessed anew."""
+        """The rectangle around the cells whose patches see the last stroke."""
 
     def stroke(self, cells: Sequence[Cell], height: float, radius: float) -> Window | None:
         """Set the ground within `radius` (m) of each cell's centre to `height` (m).
 
-        Returns the window of cells whose F was computed anew, None if no patch saw a change.
+        Returns the rectangle of cells whose patches see a change, None if there is none.
         Raises `ConfigError` if a number is not finite, the radius is negative or a cell is off the
         map.
         """
@@ -83,45 +81,14 @@ class Painting:
             away = np.hypot(ix - cell[0], iy - cell[1]) * self._resolution
             heights[away <= radius + 1e-9] = height
         self.elevation = self._map(heights)
-        prepared = patches.prepare(self.elevation).heights
-        changed = prepared != self._prepared
-        self._prepared = prepared
-        self.window = self._assess_around(changed) if changed.any() else None
+        name = self.specialist.name
+        said, seen = reassess({name: self.assessment}, self.elevation)
+        self.assessment, self.window = said[name], next(iter(find_objects(seen.astype(int))), None)
         return self.window
 
-    def _assess_around(self, changed: np.ndarray) -> Window:
-        """Assess the cells whose patches reach a changed cell; return their window."""
-        # Interpolation between cells looks one cell further than the patch's farthest point.
-        sees = patches.reach(self.specialist.grid) + self._resolution
-        # What a prepared cell depends on: the closing's dilation, then its erosion, then smoothing.
-        depends = 2 * patches.HOLE_REACH + patches.SPACING + self._resolution
-        window = self._grown(find_objects(changed.astype(int))[0], sees)
-        # The map around the window is only read, so that its cells come out as on the whole map.
-        read = self._grown(window, sees + depends)
-        part = assess(self._map(self.elevation.heights[read], read), self.specialist)
-        inner = tuple(
-            slice(w.start - r.start, w.stop - r.start) for w, r in zip(window, read, strict=True)
-        )
-        self.assessment.f[window] = part.f[inner]
-        self.assessment.reconstruction[window] = part.reconstruction[inner]
-        return window
-
-    def _grown(self, window: Window, metres: float) -> Window:
-        """Return a window with `metres` more to each side, as far as there is map."""
-        cells = math.ceil(metres / self._resolution)
-        ix, iy = (
-            slice(max(at.start - cells, 0), min(at.stop + cells, n))
-            for at, n in zip(window, self.elevation.shape, strict=True)
-        )
-        return ix, iy
-
-    def _map(self, heights: np.ndarray, at: Window = (slice(0, None), slice(0, None))):
+    def _map(self, heights: np.ndarray) -> ElevationMap:
         """Return heights as a map in its place, with every cell known."""
-        x, y = (
-            corner + span.start * self._resolution
-            for corner, span in zip(self._origin, at, strict=True)
-        )
-        return ElevationMap(heights, self._resolution, (x, y))
+        return ElevationMap(heights, self._resolution, self._origin)
 
     @property
     def shown(self) -> Float[np.ndarray, "nx ny"]:
@@ -138,7 +105,7 @@ class Painting:
         if self.window is not None:
             ix, iy = self.window
             cells = (ix.stop - ix.start) * (iy.stop - iy.start)
-            said += f"; the last stroke computed {cells} of {nx * ny} cells anew"
+            said += f"; {cells} of {nx * ny} cells see the last stroke"
         return said
 
     def _way(self, otherwise: str) -> str:
@@ -148,13 +115,11 @@ class Painting:
     def read(self, cell: Cell) -> str:
         """Return a cell's numbers; raises `ConfigError` off the map."""
         check_cell(self.elevation, cell)
-        assessment = self.assessment
-        w_ood, F = assessment.weigh()
-        tensors = {
-            "f": assessment.f, "L_recon": assessment.reconstruction, "w_ood": w_ood, "F": F
-        }  # fmt: skip
-        rows = {label: tensor[cell].tolist() for label, tensor in tensors.items()}
-        return cell_table(self.elevation, cell, assessment.headings, rows)
+        part, at = self.assessment.around(cell)
+        w_ood, F = part.weigh()
+        tensors = {"f": part.f, "L_recon": part.reconstruction, "w_ood": w_ood, "F": F}
+        rows = {label: tensor[at].tolist() for label, tensor in tensors.items()}
+        return cell_table(self.elevation, cell, part.headings, rows)
 
     def scene(self) -> Scene:
         """Draw M and F side by side, the window of the last stroke outlined."""
@@ -172,7 +137,7 @@ class Painting:
                     Panel(
                         key="F",
                         title=f"F of {name}, {self._way('best heading')}",
-                        caption="yellow: feasible; dark: closed; the frame: computed anew",
+                        caption="yellow: feasible; dark: closed; the frame: sees the last stroke",
                         colour=policy_colours([name])[name],
                     ),
                 ),
