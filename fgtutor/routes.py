@@ -18,6 +18,9 @@ from fgtutor.directions import HeadingCount, Headings
 from fgtutor.errors import PlanningError
 from fgtutor.io.validation import parse_record
 
+HAZARD, RELIEF = 1.0, 12.0
+"""Walks that end per metre are exp(`HAZARD` - `RELIEF` F): about the likeliest values (0.8, 12.1)
+for 55 drives of the A1 over its own and harder ground, 7 of which failed."""
 LARGEST = 1e12
 """The largest number in a route; sums of larger ones lose their metres, or overflow."""
 
@@ -118,6 +121,18 @@ class Route:
     def switches(self) -> int:
         """How often the policy changes on the way."""
         return int(np.count_nonzero(np.diff(self.policies)))
+
+    @property
+    def promise(self) -> float:
+        """How likely the route is to be walked to its end, from 0 to 1.
+
+        The product over its steps of exp(-l exp(`HAZARD` - `RELIEF` F)), l being a step's metres:
+        the lower F, the more walks end per metre. F itself is no probability of passing a step but
+        a tracking reward, and a product of them falls to 0 on every long route.
+        """
+        lengths = np.hypot(*np.diff(self.xy, axis=0).T)
+        ends = lengths * np.exp(HAZARD - RELIEF * self.feasibility)
+        return float(np.exp(-ends.sum()))
 
     def raise_for(self) -> Self:
         """Return the route; a `Refusal` raises its reason."""

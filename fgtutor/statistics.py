@@ -1,4 +1,4 @@
-"""Numbers that summarise trials: success rate with its interval, SPL, calibration error.
+"""Numbers that summarise trials: success rate with its interval, SPL, calibration error, AUROC.
 
 Reads outcomes of trials; gives plain floats. Sources: Wilson (1927) for the interval; Anderson et
 al., "On Evaluation of Embodied Navigation Agents" (2018) for SPL (paper, Table I).
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from jaxtyping import Float
-from scipy.stats import binomtest
+from jaxtyping import Bool, Float
+from scipy.stats import binomtest, rankdata
 
 from fgtutor.errors import ConfigError
 
@@ -90,3 +90,22 @@ def calibration(
     table = np.stack((*means, count), axis=1)
     error = np.nansum(np.abs(table[:, 0] - table[:, 1]) * count) / count.sum()
     return table, float(error)
+
+
+def auroc(
+    scores: Float[np.ndarray, "trials"], outcomes: Bool[np.ndarray, "trials"]
+) -> float | None:
+    """Return how often a trial that succeeded has a higher score than one that failed.
+
+    Equal scores count one half: 0.5 is what chance gives. None where nothing failed, or all did.
+    """
+    outcomes = np.asarray(outcomes, dtype=bool)
+    won, lost = int(outcomes.sum()), int((~outcomes).sum())
+    if not won or not lost:
+        return None
+    return float((rankdata(scores)[outcomes].sum() - won * (won + 1) / 2) / (won * lost))
+
+
+def brier(predicted: Float[np.ndarray, "trials"], outcomes: Bool[np.ndarray, "trials"]) -> float:
+    """Return the mean squared difference of predicted probabilities from outcomes (Brier, 1950)."""
+    return float(np.mean((np.asarray(predicted) - np.asarray(outcomes, dtype=float)) ** 2))

@@ -34,7 +34,9 @@ from fgtutor.statistics import Share
 from fgtutor.world.terrain import make_terrain
 
 POLICIES = ("gaps", "steps", "ours", "general")
-ROW = ["terrain", "policy", "ground", "seed", "outcome", "length", "seconds", "switches"]
+ROW = [
+    "terrain", "policy", "ground", "seed", "outcome", "length", "seconds", "switches", "promise"
+]  # fmt: skip
 
 
 @pytest.fixture

@@ -21,10 +21,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fgtutor.evaluation.cost import Cost
 from fgtutor.evaluation.shards import Run, RunConfig, collect, finished
 from fgtutor.evaluation.tasks import Task
-from fgtutor.figures.charts import draw_shares
+from fgtutor.figures.charts import draw_reliability, draw_shares
 from fgtutor.io.machine import usable_cores
 from fgtutor.io.storage import atomic_write, locked_folder, make_folder, write_json
 from fgtutor.statistics import Share
@@ -38,6 +40,20 @@ Draw = Callable[[Path], object]
 def shares_chart(groups: Mapping[str, Mapping[str, Share]], title: str) -> Draw:
     """Return what draws shares within groups, when and if the report is written."""
     return lambda path: draw_shares(groups, title=title).savefig(path)
+
+
+def reliability_chart(trials: Sequence[Mapping[str, Any]]) -> dict[str, Draw]:
+    """Return what draws the promises of routes against how many arrived, by the file's name.
+
+    Refused trials promise nothing, and neither do rows of before rows said it; nothing is drawn
+    where none does.
+    """
+    driven = [row for row in trials if row.get("promise") is not None]
+    if not driven:
+        return {}
+    promised = np.array([row["promise"] for row in driven])
+    arrived = np.array([row["outcome"] == "reached" for row in driven])
+    return {"reliability.svg": lambda path: draw_reliability(promised, arrived).savefig(path)}
 
 
 def markdown(columns: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:

@@ -174,7 +174,10 @@ def run_and_report(
         return Findings(
             table=table(trials),
             caption=f"{caption} {remark(trials)}" if remark else caption,
-            figures={"success.svg": report.shares_chart(shares, title)},
+            figures={
+                "success.svg": report.shares_chart(shares, title),
+                **report.reliability_chart(trials),
+            },
         )
 
     # By the paper's protocol, their number says which trials a ground is for.

@@ -157,6 +157,8 @@ class TrialRow(Outcome):
     """Simulated time, s."""
     switches: int
     """Policy changes on the way."""
+    promise: float | None
+    """`Route.promise`; None without a route."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -204,6 +206,7 @@ class Trial:
             "length": self.length,
             "seconds": round(self.episode.seconds, 3) if self.episode else 0.0,
             "switches": self.episode.switches if self.episode else 0,
+            "promise": round(self.route.promise, 4) if self.route else None,
         }
 
 

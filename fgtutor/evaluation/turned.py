@@ -20,12 +20,18 @@ from annotated_types import Len
 
 from fgtutor.baselines import OURS, ours
 from fgtutor.evaluation.cost import Cost, estimate
-from fgtutor.evaluation.report import Findings, markdown, run_and_report, shares_chart
+from fgtutor.evaluation.report import (
+    Findings,
+    markdown,
+    reliability_chart,
+    run_and_report,
+    shares_chart,
+)
 from fgtutor.evaluation.success import Trials, cut, terrain_seed
 from fgtutor.evaluation.tasks import Task
 from fgtutor.evaluation.trials import (
+    DisturbedConfig,
     Ground,
-    PlannedConfig,
     TrialRow,
     by_cell,
     drive_plans,
@@ -45,7 +51,7 @@ COMMAND = "evaluate turned"
 
 
 @dataclass(frozen=True, kw_only=True)
-class TurnedConfig(PlannedConfig):
+class TurnedConfig(DisturbedConfig):
     """Cross one obstacle, turned by some angles."""
 
     robot: str = "a1"
@@ -119,7 +125,7 @@ def run_task(
             "planned": round(trial.route.length, 3) if trial.route else None,
             "planning": round(trial.planned.seconds, 3),
         }
-        for trial in drive_plans(OURS, plans, zoo, follow)
+        for trial in drive_plans(OURS, plans, zoo, follow, config.condition)
     ]
 
 
@@ -166,7 +172,7 @@ def run(config: TurnedConfig) -> int:
     def cost() -> Cost:
         each = config.trials * len(config.angles)
         grounds = [config.terrain(kind, config.angles[0]) for kind in config.kinds]
-        return estimate(zoo, grounds, grounds=each, episodes=each)
+        return estimate(zoo, grounds, grounds=each, episodes=each, condition=config.condition)
 
     def find(trials: list[TurnedRow]) -> Findings:
         groups: dict[str, dict[str, Share]] = {}
@@ -179,13 +185,13 @@ def run(config: TurnedConfig) -> int:
                 f"Success in % with 95 % intervals, {config.trials:,} trials per cell, each on a "
                 "held-out ground of its own that the obstacle crosses from border to border; "
                 f"robot {config.robot}, difficulty {config.difficulty:g}, specialists "
-                f"{', '.join(zoo)}, {config.planning}, seed {config.seed}. The planner knows the "
-                "true map, each policy the ground around the robot; nothing disturbs the robot "
-                "but a start off by 3 cm and 0.03 rad. SPL against the shortest way of the "
-                f"geometry, {fmean(t['shortest'] for t in trials):.2f} m in the mean; planning is "
-                "the median time on one core, from the map to the route."
+                f"{', '.join(zoo)}, {config.planning}, seed {config.seed}; "
+                f"{config.told(config.condition)}. The planner knows the true map. SPL against "
+                "the shortest way of the geometry, "
+                f"{fmean(t['shortest'] for t in trials):.2f} m in the mean; planning is the "
+                "median time on one core, from the map to the route."
             ),
-            figures={"success.svg": shares_chart(groups, title)},
+            figures={"success.svg": shares_chart(groups, title), **reliability_chart(trials)},
         )
 
     return run_and_report(

@@ -20,7 +20,7 @@ from fgtutor.errors import ConfigError
 from fgtutor.feasibility import ood_weight
 from fgtutor.figures.style import INK, LINES, TITLE, Picture, colours_of
 from fgtutor.io.validation import Positive, check_arguments
-from fgtutor.statistics import Share
+from fgtutor.statistics import Share, auroc, brier
 from fgtutor.world.terrain import Terrain
 
 if TYPE_CHECKING:
@@ -103,6 +103,39 @@ def draw_shares(groups: Mapping[str, Mapping[str, Share]], *, title: str) -> Pic
         axes.set_title(group, fontsize=9.5, loc="left")
     panels[-1].set_xlabel("share that reached the goal; the line is the 95 % interval")
     figure.suptitle(title, **TITLE, x=0.01)
+    return figure
+
+
+def draw_reliability(
+    promised: Float[np.ndarray, " trials"], arrived: Bool[np.ndarray, " trials"], *, bins: int = 10
+) -> Picture:
+    """Draw how many of the routes that promised as much arrived, in equal bins of the promise."""
+    figure = Picture(5.0, 6.2)
+    axes, counts = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
+    index = np.clip((promised * bins).astype(int), 0, bins - 1)
+    edges, used = np.linspace(0, 1, bins + 1), np.unique(index)
+    shares = [Share.of(arrived[index == one]) for one in used]
+    means = [promised[index == one].mean() for one in used]
+    low, high = zip(*(share.interval for share in shares), strict=True)
+    axes.plot((0, 1), (0, 1), "--", color="grey", label="perfect: what is promised comes true")
+    axes.vlines(means, low, high, color=INK, linewidth=2, label="95 % interval")
+    rates = [share.successes / share.trials for share in shares]
+    axes.plot(means, rates, "o", color=LINES[0], label="these routes")
+    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), ylabel="share that arrived")
+    axes.legend(loc="upper left", frameon=False, fontsize=9)
+    rank = auroc(promised, arrived)
+    words = f"Brier score {brier(promised, arrived):.3f}"
+    words += f", AUROC {rank:.3f}" if rank is not None else ", none failed or all did"
+    axes.set_title(words, **TITLE, loc="left")
+    counts.bar(
+        edges[:-1],
+        np.bincount(index, minlength=bins),
+        np.diff(edges),
+        align="edge",
+        color="#9DB8C9",
+        edgecolor="white",
+    )
+    counts.set(xlabel="what the route promised", ylabel="trials")
     return figure
 
 
