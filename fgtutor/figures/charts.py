@@ -122,7 +122,7 @@ def draw_reliability(
     rates = [share.successes / share.trials for share in shares]
     axes.plot(means, rates, "o", color=LINES[0], label="these routes")
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), ylabel="share that arrived")
-    axes.legend(loc="upper left", frameon=False, fontsize=9)
+    axes.legend(loc="lower right", frameon=False, fontsize=9)
     rank = auroc(promised, arrived)
     words = f"Brier score {brier(promised, arrived):.3f}"
     words += f", AUROC {rank:.3f}" if rank is not None else ", none failed or all did"
