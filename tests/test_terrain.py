@@ -431,3 +431,44 @@ def test_any_draw_is_sound(
     assert terrain.elevation.height_at(*terrain.goal) == 0
     assert np.abs(terrain.elevation.heights).max() <= 1.5
     assert all(min(box.size) > 0 for box in terrain.boxes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["steps", "gaps", "bridge", "valley"])
+def test_no_evaluation_map_equals_one_of_training(kind):
+    def levelled(**how):
+        # A hole is a hole: what policies and nets see of a chasm ends 0.5 m below the ground.
+        return make_terrain(kind, robot="a1", **how).elevation.heights.clip(-0.5).tobytes()
+
+    # Most beams and valleys of training are laid at nearly its last difficulty; all at the last
+    # one is the hardest case.
+    trained = {levelled(seed=2 * seed) for seed in range(400)}
+    alike = sum(levelled(seed=2 * seed + 1) in trained for seed in range(400))
+    assert sum(levelled(seed=2 * seed + 1, unlike=True) in trained for seed in range(400)) == 0
+    if kind in ("bridge", "valley"):
+        assert alike > 40  # they have two numbers, drawn in whole cells: seeds alone do not differ
+
+
+@pytest.mark.parametrize("robot", ["toy", "a1"])
+@pytest.mark.parametrize("kind", ["bridge", "valley"])
+def test_what_is_unlike_training_is_longer_than_any_of_it(robot, kind):
+    scale = ROBOTS[robot].scale
+    for seed in range(20):
+        part = make_terrain(kind, robot=robot, seed=seed, unlike=True).sections[0]
+        longer = (part.x1 - part.x0 - scale.longest(kind)) / scale.resolution
+        assert round(longer) in range(1, 7) and longer == pytest.approx(round(longer), abs=1e-6)
+        start = make_terrain(kind, robot=robot, seed=seed).sections[0].x0
+        assert part.x0 == start  # nothing else moves
+
+
+def test_slots_unlike_training_step_aside_by_a_cell():
+    for seed in range(10):
+        one, other = (
+            make_terrain("gaps", robot="a1", seed=seed, unlike=how) for how in (False, True)
+        )
+        straight, bent = one.elevation.heights, other.elevation.heights
+        assert (straight == straight[:, :1]).all()
+        # On the right it is as it was, on the left a cell further; nowhere else.
+        assert (bent[:, 0] == straight[:, 0]).all()
+        assert (bent[1:, -1] == straight[:-1, -1]).all()
+        assert (np.diff(bent, axis=1) != 0).any(axis=0).sum() == 1

@@ -94,7 +94,8 @@ def axes(config: RobustnessConfig) -> dict[str, Axis]:
 def make_ground(config: RobustnessConfig, terrain: str, index: int) -> Ground:
     """Make one ground, the same as that of `evaluate matrix`, to be driven once."""
     seed = terrain_seed(config.seed, index)
-    made = make_terrain(terrain, robot=config.robot, difficulty=config.difficulty, seed=seed)
+    how = {"robot": config.robot, "difficulty": config.difficulty, "seed": seed}
+    made = make_terrain(terrain, **how, unlike=True)
     return Ground(terrain=made, seeds=(seed,))
 
 
@@ -247,6 +248,7 @@ def run(config: RobustnessConfig) -> int:
         settings=config.run_settings(
             COMMAND,
             without=("trials", "axes", "terrains", "passed"),
+            unlike=True,
             conditions=ranges(known.axes, known.undisturbed),
         ),
         cost=cost,

@@ -69,6 +69,7 @@ def make_ground(config: TrialsConfig, terrain: str, index: int) -> Ground:
         robot=config.robot,
         difficulty=config.difficulty,
         seed=terrain_seed(config.seed, index),
+        unlike=True,
     )
     if config.protocol == "paper" and terrain != "mixed":
         made = with_random_ends(made, made.seed)
@@ -187,7 +188,12 @@ def run_and_report(
         title=title,
         tasks=make_tasks(config, terrains, policies, work),
         settings=config.run_settings(
-            command, without=("trials",), terrains=terrains, policies=policies, **number
+            command,
+            without=("trials",),
+            terrains=terrains,
+            policies=policies,
+            unlike=True,
+            **number,
         ),
         cost=cost,
         find=find,

@@ -100,12 +100,22 @@ class TerrainScale:
 
 
 class Course:
-    """A corridor under construction: collects boxes, and knows the scale, difficulty and rng."""
+    """A corridor under construction: collects boxes, and knows the scale, difficulty and rng.
 
-    def __init__(self, scale: TerrainScale, difficulty: float, rng: np.random.Generator) -> None:
+    With `unlike`, another rng, its obstacles are none that could be drawn without: see
+    `make_terrain`.
+    """
+
+    def __init__(
+        self,
+        scale: TerrainScale,
+        difficulty: float,
+        rng: np.random.Generator,
+        unlike: np.random.Generator | None = None,
+    ) -> None:
         self.scale = scale
         self.difficulty = difficulty
-        self.rng = rng
+        self.rng, self.unlike = rng, unlike
         self.boxes: list[Box] = []
         self.depth = float(np.interp(difficulty, (0.0, 0.7, 1.0), scale.chasm_depth))
         self.severity = scale.ease + (1 - scale.ease) * difficulty
@@ -227,14 +237,21 @@ def _gaps(course: Course, x0: float, x1: float) -> float:
     widest = course.snap(max(course.scale.gap_width))
     shortest, longest = course.scale.platform
     longest = max(shortest, min(longest, (x1 - x0) / 2 - 0.5))  # two gaps in a short section too
-    edge, slot = x0, x0 + course.draw(0.2, 0.2 * (x1 - x0))
+    edges, slot = [x0], x0 + course.draw(0.2, 0.2 * (x1 - x0))
     for _ in range(5):
         if slot + widest > x1 - 0.2:
             break
-        course.full(edge, slot)
-        edge = slot + width
+        edges += [slot, slot + width]
         slot = slot + widest + course.draw(shortest, longest)
-    course.full(edge, x1)
+    edges.append(x1)
+    lanes = [(0.0, course.width, 0.0)]
+    if course.unlike:  # a slot is straight, or steps aside by a cell
+        cut = course.snap(course.width * course.unlike.uniform(0.1, 0.9))
+        lanes = [(0.0, cut, 0.0), (cut, course.width, course.scale.resolution)]
+    for y0, y1, aside in lanes:
+        bent = [x0, *(edge + aside for edge in edges[1:-1]), x1]
+        for near, far in zip(bent[::2], bent[1::2], strict=True):
+            course.block(near, far, y0, y1, 0.0)
     return course.middle
 
 

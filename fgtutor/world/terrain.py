@@ -125,6 +125,7 @@ def make_terrain(
     resolution: Resolution | None = None,
     scale: TerrainScale | None = None,
     neighbours: bool = False,
+    unlike: bool = False,
 ) -> Terrain:
     """Make a corridor along x: flat ground, the obstacle over the full width, flat ground.
 
@@ -140,6 +141,10 @@ def make_terrain(
         scale: Sizes to use instead of the robot's preset.
         neighbours: Lay other obstacles of the mixed terrain at both ends, a landing away. For
             training: the way goes from landing to landing, and sees what a mixed route shows.
+        unlike: Lay an obstacle that no seed gives without it, so that its map equals none of any
+            training. Beams and valleys are longer than the scale's by 1 to 6 cells, and slots step
+            aside by a cell; other kinds have heights that two seeds share with probability 0, and
+            so has the mixed terrain, by its steps. Flat ground is flat.
 
     Raises:
         TerrainError: A name is unknown, a number is out of range, or the mixed terrain has no
@@ -154,7 +159,8 @@ def make_terrain(
     if resolution is not None:
         scale = replace(scale, resolution=resolution)
     rng = np.random.default_rng((seed, TERRAINS.index(name)))
-    course = Course(scale, difficulty, rng)
+    other = np.random.default_rng((seed, TERRAINS.index(name), 1))
+    course = Course(scale, difficulty, rng, other if unlike and name != "mixed" else None)
     sections: list[Section] = []
     lane: list[Point] = []
     apron, width = course.snap(scale.apron), course.snap(scale.width)
@@ -230,6 +236,8 @@ def _plan(course: Course, name: str, apron: float) -> list[tuple[str, float, flo
             )
         length = min(room, scale.longest(name))
         x0 = course.snap(apron + rng.uniform(0.0, room - length))
+        if course.unlike and length < room:
+            length += scale.resolution * int(course.unlike.integers(1, 7))
         return [(name, x0, course.snap(x0 + length))]
     # Lengths vary, their sum does not: all mixed terrains of a robot have the same size.
     shares = rng.uniform(-0.4, 0.4, len(scale.mixed))
