@@ -51,6 +51,11 @@ COMMANDS = {
         "TurnedConfig",
         "cross one obstacle, turned by some angles",
     ),
+    "evaluate openground": (
+        "evaluation.openground",
+        "OpenGroundConfig",
+        "plan and drive over maps with several ways across, and with tasks that have none",
+    ),
     "evaluate robustness": (
         "evaluation.robustness",
         "RobustnessConfig",
