@@ -74,9 +74,8 @@ HEADINGS = 16
 """Headings that the shortest way may take."""
 PAPERS = "paper"
 """The planner that is ours by the paper's settings."""
-TUNED = {"traversability": 0.12, "occupancy": 0.12}
-"""Critical steps of the classical planners, m, chosen on other maps: of 0.08, 0.12, 0.16 and 0.2
-those with which most feasible tasks were reached."""
+STEPS = {"traversability": TraversabilityConfig.step, "occupancy": OccupancyConfig.step}
+"""Critical steps of the classical planners, m: the published ones, chosen on no map of ours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +102,7 @@ class OpenGroundConfig(PlannedConfig):
         "occupancy",
     )
     """Planners: ours, by the settings; paper, ours by the paper's; and those of `evaluate
-    baselines`. After traversability@ or occupancy@, another critical step than the tuned one, m."""
+    baselines`. After traversability@ or occupancy@ goes another critical step, m, than theirs."""
 
 
 def make_ground(config: OpenGroundConfig, index: int) -> OpenGround:
@@ -127,9 +126,9 @@ def ways(
     found: dict[str, tuple[Planner, PlanSettings]] = {}
     for name in config.planners:
         base, at, text = name.partition("@")
-        if base in TUNED and base in known:
+        if base in STEPS and base in known:
             try:
-                step = float(text) if at else TUNED[base]
+                step = float(text) if at else STEPS[base]
             except ValueError:
                 raise ConfigError(f"{name!r}: a critical step in metres goes after @") from None
             cells = _traversability if base == "traversability" else _occupancy
@@ -184,7 +183,7 @@ def plan_map(
             assessed[key] = AssessedMap(terrain.elevation, zoo, *key)
         began = process_time()
         planner(assessed[key])  # whatever it needs is kept
-        who = (*key, name if name == GENERAL or name.partition("@")[0] in TUNED else OURS)
+        who = (*key, name if name == GENERAL or name.partition("@")[0] in STEPS else OURS)
         took.setdefault(who, process_time() - began)
         answers = plan_all(planner, grounds, [assessed[key]] * len(grounds), settings)
         shared = [
@@ -327,7 +326,7 @@ def run(config: OpenGroundConfig) -> int:
         config,
         title=f"Open ground ({config.robot})",
         tasks=make_tasks(config),
-        settings=config.run_settings(COMMAND, without=("maps",), tuned=TUNED),
+        settings=config.run_settings(COMMAND, without=("maps",), steps=STEPS),
         cost=cost,
         find=find,
     )
