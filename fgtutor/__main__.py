@@ -19,6 +19,11 @@ from fgtutor.errors import FgtutorError
 COMMANDS = {
     "demo": ("cli.demo", "DemoConfig", "plan over a mixed terrain and drive it"),
     "train": ("learning.training", "config_of", "train a specialist with its Feasibility-Net"),
+    "calibrate": (
+        "learning.calibrate",
+        "CalibrateConfig",
+        "measure what a specialist finds familiar, on held-out terrain",
+    ),
     "sweep": ("evaluation.sweep", "config_of", "train specialists side by side and compare them"),
     "plan": ("cli.plan", "PlanConfig", "plan a route over a map file"),
     "evaluate matrix": (

@@ -1,13 +1,16 @@
 """Feasibility-Net: how well a policy would track a command here, and how familiar the terrain is.
 
 Reads a patch H_xy (`patches.sample_patches`) and a velocity command; gives the feasibility f in
-[0, 1] and the reconstruction loss L_recon from which the weight w_ood follows. The labels that f
-is trained on come from a rollout's velocities (`tracking_reward`, `feasibility_labels`).
-Source: paper, Sec. III-A (Eqs. 1-3) and Sec. III-B (Eq. 4).
+[0, 1] and the reconstruction loss L_recon from which the weight w_ood follows (`OodScore`). The
+labels that f is trained on come from a rollout's velocities (`tracking_reward`,
+`feasibility_labels`).
+Source: paper, Sec. III-A (Eqs. 1-3) and Sec. III-B (Eq. 4). The saturation of heights, strangeness
+and its p-value are ours.
 """
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, overload
 
@@ -22,8 +25,14 @@ from fgtutor.io.validation import Width
 
 HeightScale = Annotated[float, Interval(gt=0, le=1000)]
 """Units of height per metre."""
+Saturation = Annotated[float, Interval(gt=0, le=100)]
+"""Difference of heights beyond which the autoencoder hardly tells more from less, m."""
 TAU_LOW, TAU_HIGH = 0.1, 2.0
 """The paper's thresholds on L_recon, summed over the patch (Eq. 4)."""
+ALPHA = 0.03
+"""Share of its own terrain that a policy may call less than fully familiar."""
+LEVELS = (0.5, 0.9, 0.95, 0.99, 0.995, 0.999)
+"""Quantiles of L_recon and of the strangeness on its own terrain that a specialist stores."""
 SIGMA = 0.25
 """Scale of the tracking reward, m/s (Eq. 1)."""
 
@@ -68,8 +77,9 @@ def feasibility_labels(
 class FeasibilityNet(nn.Module):
     """An MLP head for feasibility beside a variational autoencoder of patches (paper, Fig. 2).
 
-    Patches enter times a fixed `height_scale`, never clipped or normalised one by one: what a layer
-    sees stays a linear function of the map, which `tensorization` relies on.
+    Patches enter times a fixed `height_scale`, never normalised one by one. For the autoencoder
+    they may saturate before: else the depth of a chasm or the top of a wall, far beyond any step,
+    makes most of the loss, and the shape of the ground under the robot little of it.
     """
 
     def __init__(
@@ -81,6 +91,7 @@ class FeasibilityNet(nn.Module):
         vae_hidden: tuple[Width, Width] = (256, 128),
         latent: Width = 16,
         height_scale: HeightScale = 4.0,
+        saturation: Saturation | None = None,
     ) -> None:
         """Build the head and the two halves of the autoencoder.
 
@@ -92,11 +103,12 @@ class FeasibilityNet(nn.Module):
             latent: Width of the latent.
             height_scale: Units of height per metre. At 4 a unit is 0.25 m, a tall step for these
                 robots; then the paper's tau = 0.1 and 2.0 lie between known and unknown terrain.
+            saturation: The autoencoder sees heights h as s tanh(h / s), s in m; None is h itself.
         """
         super().__init__()
         self.num_points, self.command_dim = num_points, command_dim
         self.hidden, self.vae_hidden = tuple(hidden), tuple(vae_hidden)
-        self.latent, self.height_scale = latent, height_scale
+        self.latent, self.height_scale, self.saturation = latent, height_scale, saturation
         self.head = _mlp(nn.ELU, num_points + command_dim, *hidden, 1)
         # tanh saturates: unlike ELU it cannot extrapolate to terrain steeper than any it has seen.
         self.encoder = _mlp(nn.Tanh, num_points, *vae_hidden, 2 * latent)
@@ -109,14 +121,31 @@ class FeasibilityNet(nn.Module):
         inputs = torch.cat((self.height_scale * patch, command), dim=-1)
         return torch.sigmoid(self.head(inputs)).squeeze(-1)
 
+    def relief(self, patch: Float[Tensor, "*batch points"]) -> Float[Tensor, "*batch points"]:
+        """Return the heights that the autoencoder sees, in its units."""
+        if self.saturation is not None:
+            patch = self.saturation * torch.tanh(patch / self.saturation)
+        return self.height_scale * patch
+
     def reconstruction(self, patch: Float[Tensor, "*batch points"]) -> Float[Tensor, "*batch"]:
         """Return L_recon: the squared height error SUMMED over the patch, in scaled units.
 
         It decodes the latent mean, so the same patch always gets the same answer.
         """
-        heights = self.height_scale * patch
+        return self.losses(patch)[0]
+
+    def losses(
+        self, patch: Float[Tensor, "*batch points"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        """Return L_recon and the strangeness L_recon / (1 + sum h^2), h in scaled units.
+
+        The share of a patch's relief that is not understood: low rubble, badly reconstructed, is
+        as strange as a high wall.
+        """
+        heights = self.relief(patch)
         mean, _ = self.encoder(heights).chunk(2, dim=-1)
-        return (self.decoder(mean) - heights).square().sum(dim=-1)
+        loss = (self.decoder(mean) - heights).square().sum(dim=-1)
+        return loss, loss / (1 + heights.square().sum(dim=-1))
 
     def loss(
         self,
@@ -133,7 +162,19 @@ class FeasibilityNet(nn.Module):
         Eqs. 2-3 with the paper's alpha and beta. In training mode the latent is sampled (and
         reparameterised, with `generator` if given); in evaluation mode it is the mean.
         """
-        heights = self.height_scale * patch
+        reconstruction, parts = self.autoencoder_loss(patch, beta=beta, generator=generator)
+        error = (self.feasibility(patch, command) - r_v).square().mean()
+        return error + alpha * reconstruction, {"feasibility": error, **parts}
+
+    def autoencoder_loss(
+        self,
+        patch: Float[Tensor, "batch points"],
+        *,
+        beta: float = 5e-4,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Float[Tensor, ""], dict[str, Float[Tensor, ""]]]:
+        """Return L_recon + beta L_KL and its two parts, batch means (Eq. 3); sampled as `loss`."""
+        heights = self.relief(patch)
         mean, log_variance = self.encoder(heights).chunk(2, dim=-1)
         latent = mean
         if self.training:
@@ -141,12 +182,10 @@ class FeasibilityNet(nn.Module):
             latent = mean + noise * torch.exp(0.5 * log_variance)
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)
         parts = {
-            "feasibility": (self.feasibility(patch, command) - r_v).square().mean(),
             "reconstruction": (self.decoder(latent) - heights).square().sum(dim=-1).mean(),
             "kl": divergence.mean(),
         }
-        total = parts["feasibility"] + alpha * (parts["reconstruction"] + beta * parts["kl"])
-        return total, parts
+        return parts["reconstruction"] + beta * parts["kl"], parts
 
 
 @overload
@@ -172,6 +211,94 @@ def ood_weight(
     if isinstance(weight, Tensor | np.ndarray):
         return weight.clip(0, 1)
     return min(max(float(weight), 0.0), 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class OodScore:
+    """By what a patch is called strange, and the weight w_ood that follows.
+
+    The paper's is L_recon between two thresholds (Eq. 4). Ours is a p-value: the share of patches
+    of the policy's own held-out terrain that are at least as strange (a conformal test). A patch is
+    strange if either L_recon or the strangeness (`FeasibilityNet.losses`) is: p is twice the
+    smaller one of their two p-values (Bonferroni). So one number, `alpha`, means the same for every
+    policy: of its own terrain, a share of at most alpha loses weight.
+    """
+
+    taus: tuple[float, float] | None = (TAU_LOW, TAU_HIGH)
+    """Thresholds on L_recon; None: ours."""
+    own: tuple[Mapping[str, float], Mapping[str, float]] | None = None
+    """Quantiles of L_recon and of the strangeness on the own terrain, by probability ("0.99": ...);
+    ours only."""
+    alpha: float = ALPHA
+    """p-value from which a patch has full weight; ours only."""
+
+    def __post_init__(self) -> None:
+        if self.taus is not None:
+            ood_weight(0.0, *self.taus)
+        elif not 0 < self.alpha < 1:
+            raise ThresholdError(f"alpha must lie between 0 and 1, got {self.alpha!r}")
+        else:
+            self._tails()
+
+    def weight(
+        self, loss: Float[Tensor, "*batch"], strangeness: Float[Tensor, "*batch"] | None = None
+    ) -> Float[Tensor, "*batch"]:
+        """Return w_ood in [0, 1]: Eq. 4 of L_recon, or clip(p / alpha).
+
+        Raises `ThresholdError` if ours is asked for without the strangeness.
+        """
+        if self.taus is not None:
+            return ood_weight(loss, *self.taus)
+        if strangeness is None:
+            raise ThresholdError(
+                "calibrated weights need the strangeness of each patch: assess the map, or give "
+                "thresholds on L_recon"
+            )
+        return (self.p_value(loss, strangeness) / self.alpha).clip(0, 1)
+
+    def p_value(
+        self, loss: Float[Tensor, "*batch"], strangeness: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Return p in [0, 1], ours only."""
+        each = zip(self._tails(), (loss, strangeness), strict=True)
+        first, second = (_share_beyond(*tail, score) for tail, score in each)
+        return (2 * first.minimum(second)).clip(0, 1)
+
+    def _tails(self) -> list[tuple[Tensor, Tensor]]:
+        """Return for both scores the shares of own patches beyond each quantile, and the latter."""
+        tails = []
+        for quantiles in self.own or ({}, {}):
+            try:
+                pairs = sorted((float(level), float(score)) for level, score in quantiles.items())
+            except (TypeError, ValueError, OverflowError):
+                pairs = []
+            levels, scores = [level for level, _ in pairs], [score for _, score in pairs]
+            growing = all(0 < a < b < math.inf for a, b in pairwise(scores))
+            if len(pairs) < 2 or not growing or levels[0] <= 0 or levels[-1] >= 1:
+                raise ThresholdError(
+                    "calibrated weights need two or more positive, increasing quantiles of L_recon "
+                    f"and of the strangeness, got {dict(quantiles)}: run `fgtutor calibrate` on "
+                    'the folder, or use taus="paper"'
+                )
+            tails.append((1 - torch.tensor(levels), torch.tensor(scores)))
+        return tails
+
+
+def _share_beyond(
+    shares: Float[Tensor, "levels"],
+    scores: Float[Tensor, "levels"],
+    score: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch"]:
+    """Return the share of own patches with at least this score.
+
+    Between the quantiles its logarithm is linear in that of the score, and beyond the last one it
+    falls on as steeply (a Pareto tail).
+    """
+    x, p = torch.log(scores), torch.log(shares)
+    at = torch.log(score.clamp(min=1e-12)).contiguous()
+    i = torch.searchsorted(x, at).clamp(1, len(x) - 1)
+    slope = (p[i] - p[i - 1]) / (x[i] - x[i - 1])
+    return torch.exp(p[i - 1] + slope * (at - x[i - 1])).clip(0, 1)
 
 
 def calibrated_taus(quantiles: Mapping[str, float]) -> tuple[float, float]:

@@ -78,6 +78,9 @@ class Specialist:
     quantiles: Mapping[str, float]
     """Quantiles of L_recon on its own terrain, in the Feasibility-Net's scaled units, by
     probability ("0.95": ...)."""
+    strangeness: Mapping[str, float] = field(default_factory=dict)
+    """Quantiles of the strangeness (`FeasibilityNet.losses`) on its own held-out terrain; none if it
+    was never calibrated (`fgtutor calibrate`)."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """Where it came from: terrain, samples, seed, package versions; kept as JSON keeps it."""
 
@@ -95,7 +98,8 @@ class Specialist:
             )
         if self.command[0] <= 0:
             raise SpecialistError(f"command: 0: should go ahead, got {self.command}")
-        _check_quantiles(self.quantiles)
+        _check_quantiles(self.quantiles, "quantiles")
+        _check_quantiles(self.strangeness, "strangeness")
         known = {k: v for k, v in self.provenance.items() if k in _Known.__annotations__}
         parse_record(_Known, known, SpecialistError, "provenance")
 
@@ -288,9 +292,13 @@ class _Description:
     provenance: dict[str, Any]
     files: dict[str, Digest]
     checksum: str
+    strangeness: dict[str, float] = field(default_factory=dict)
 
 
-_PLAIN = ("name", "robot", "grid", "command", "label_seconds", "quantiles", "provenance")
+_PLAIN = (
+    *("name", "robot", "grid", "command", "label_seconds"),
+    *("quantiles", "strangeness", "provenance"),
+)
 """What a description holds as a specialist does."""
 
 
@@ -376,14 +384,14 @@ def _build(
         ) from error
 
 
-def _check_quantiles(quantiles: Mapping[str, float]) -> None:
+def _check_quantiles(quantiles: Mapping[str, float], name: str) -> None:
     """Raise `SpecialistError` unless they are quantiles: by probability, and growing with it."""
-    read = parse_record(dict[str, float], dict(quantiles), SpecialistError, "quantiles")
+    read = parse_record(dict[str, float], dict(quantiles), SpecialistError, name)
     try:
         pairs = [(0.0, 0.0), *sorted((float(share), value) for share, value in read.items())]
     except ValueError as error:
-        raise SpecialistError(f"quantiles: need probabilities, {error}") from error
+        raise SpecialistError(f"{name}: need probabilities, {error}") from error
     if not all(a < b < 1 and low <= high for (a, low), (b, high) in pairwise(pairs)):
         raise SpecialistError(
-            f"quantiles: need numbers from 0 that grow with a probability below 1, got {read}"
+            f"{name}: need numbers from 0 that grow with a probability below 1, got {read}"
         )

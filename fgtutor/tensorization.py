@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, get_args
 
 import numpy as np
@@ -25,7 +25,7 @@ from fgtutor import patches
 from fgtutor.directions import HeadingCount, Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, ThresholdError
-from fgtutor.feasibility import TAU_HIGH, TAU_LOW, calibrated_taus, ood_weight
+from fgtutor.feasibility import TAU_HIGH, TAU_LOW, OodScore, calibrated_taus, ood_weight
 from fgtutor.grid import point_text
 from fgtutor.io.machine import require_memory
 from fgtutor.io.progress import watch
@@ -46,19 +46,30 @@ class Assessment:
     """L_recon, summed over the patch in the units the VAE sees (metres times `height_scale`)."""
     elevation: ElevationMap
     """The map that was assessed."""
-    taus: tuple[float, float] = (TAU_LOW, TAU_HIGH)
-    """Thresholds of w_ood: the specialist's own, unless others were asked for."""
+    score: OodScore = field(default_factory=OodScore)
+    """What w_ood follows from: the specialist's own calibration, or thresholds on L_recon."""
     specialist: Specialist | None = None
     """Whose assessment it is; None for numbers made by hand."""
+    strangeness: Float[Tensor, "nx ny d"] | None = None
+    """L_recon as a share of the patch's relief (`FeasibilityNet.losses`), which calibrated weights
+    need; None for numbers made by hand."""
 
     @property
     def headings(self) -> Headings:
         """What the last axis counts."""
         return Headings.of(self.f)
 
+    @property
+    def said(self) -> dict[str, Tensor]:
+        """The numbers of every cell and heading, by the name of their field."""
+        each = {name: getattr(self, name) for name in ("f", "reconstruction", "strangeness")}
+        return {name: values for name, values in each.items() if values is not None}
+
     def ood(self, tau_low: float | None = None, tau_high: float | None = None) -> Tensor:
-        """Return w_ood (Eq. 4), [nx, ny, d], by `taus` unless thresholds are given."""
-        low, high = self.taus
+        """Return w_ood, [nx, ny, d]: by `score`, or by thresholds on L_recon if given (Eq. 4)."""
+        if tau_low is None and tau_high is None:
+            return self.score.weight(self.reconstruction, self.strangeness)
+        low, high = self.score.taus or (TAU_LOW, TAU_HIGH)
         low, high = low if tau_low is None else tau_low, high if tau_high is None else tau_high
         return ood_weight(self.reconstruction, low, high)
 
@@ -69,7 +80,7 @@ class Assessment:
         *,
         unknown: Unknown = "block",
     ) -> Float[Tensor, "nx ny d"]:
-        """Return F_i = w_ood * f (Eq. 5), by `taus` unless thresholds are given.
+        """Return F_i = w_ood * f (Eq. 5), by `score` unless thresholds are given.
 
         Of a step over several cells it is the least of theirs. It is 0 where a step would start
         from, pass through or end on an unknown cell, or leave the map; `unknown="fill"` trusts the
@@ -115,9 +126,7 @@ class Assessment:
         )
         known, heights = self.elevation.known[at], self.elevation.heights[at]
         elevation = replace(self.elevation, heights=heights, known=known, origin=(x, y))
-        part = replace(
-            self, f=self.f[at], reconstruction=self.reconstruction[at], elevation=elevation
-        )
+        part = replace(self, elevation=elevation, **{k: v[at] for k, v in self.said.items()})
         return part, (cell[0] - ix, cell[1] - iy)
 
 
@@ -183,18 +192,18 @@ def assess_all(
     """
     if method not in WAYS:
         raise ConfigError(f"method must be one of {', '.join(WAYS)}, got {method!r}")
-    thresholds = {name: resolve_taus(taus, specialist) for name, specialist in zoo.items()}
+    scores = {name: ood_score(taus, specialist) for name, specialist in zoo.items()}
     (nx, ny), yaws = elevation.shape, Headings(headings).yaws
     work = f"assessing {nx} x {ny} cells for {len(zoo)} polic{'y' if len(zoo) == 1 else 'ies'}"
-    # f and L_recon in 4 bytes each, and one F_i.
-    needed = 4.0 * nx * ny * len(yaws) * (2 * len(zoo) + 1)
+    # f, L_recon and the strangeness in 4 bytes each, and one F_i.
+    needed = 4.0 * nx * ny * len(yaws) * (3 * len(zoo) + 1)
     require_memory(needed, work, "take a part of the map (ElevationMap.crop) or coarser cells")
     heights = patches.prepare(elevation).heights
-    blank = torch.empty(nx, ny, len(yaws))
-    assessments = {
-        name: Assessment(blank.clone(), blank.clone(), elevation, thresholds[name], specialist)
-        for name, specialist in zoo.items()
-    }
+    blank = torch.empty(3, nx, ny, len(yaws))
+    assessments = {}
+    for name, specialist in zoo.items():
+        f, loss, strange = blank.clone()
+        assessments[name] = Assessment(f, loss, elevation, scores[name], specialist, strange)
     tiles = dict.fromkeys((one.grid for one in zoo.values()), tiles_of(heights.shape))
     _assess_tiles(zoo, heights, tiles, assessments, method, work if progress else None)
     return assessments
@@ -236,9 +245,7 @@ def reassess(
         for grid, cells in seen.items()
     }
     renewed = {
-        name: replace(
-            one, f=one.f.clone(), reconstruction=one.reconstruction.clone(), elevation=elevation
-        )
+        name: replace(one, elevation=elevation, **{k: v.clone() for k, v in one.said.items()})
         for name, one in assessments.items()
     }
     _assess_tiles(zoo, heights, tiles, renewed)
@@ -275,20 +282,23 @@ def _assess_tiles(
             net, one = specialist.feasibility, assessments[name]
             command = torch.tensor(specialist.command, dtype=torch.float32)
             f = net.feasibility(distinct, command.expand(len(distinct), -1))
-            found = f, net.reconstruction(distinct)
-            for values, whole in zip(found, (one.f, one.reconstruction), strict=True):
+            found = f, *net.losses(distinct)
+            for values, whole in zip(found, one.said.values(), strict=True):
                 whole[rows, columns, heading] = values[cells].reshape(rows.stop - rows.start, -1)
 
 
-def resolve_taus(taus: Taus, specialist: Specialist) -> tuple[float, float]:
-    """Return (tau_low, tau_high) for a choice by name, or the given pair.
+def ood_score(taus: Taus, specialist: Specialist) -> OodScore:
+    """Return what w_ood follows from: the specialist's calibration, or thresholds on L_recon.
 
-    Raises `ThresholdError` for another name, and unless 0 <= tau_low < tau_high, both finite.
+    Raises `ThresholdError` for another name, unless 0 <= tau_low < tau_high, both finite, and for
+    "calibrated" if the specialist was never calibrated.
     """
     if taus == "paper":
-        return TAU_LOW, TAU_HIGH
+        return OodScore()
     if taus == "calibrated":
-        return calibrated_taus(specialist.quantiles)
+        if not specialist.strangeness:
+            return OodScore(calibrated_taus(specialist.quantiles))
+        return OodScore(None, (specialist.quantiles, specialist.strangeness))
     try:
         low, high = (float(tau) for tau in taus)
     except (TypeError, ValueError):
@@ -298,7 +308,7 @@ def resolve_taus(taus: Taus, specialist: Specialist) -> tuple[float, float]:
             'taus must be "paper", "calibrated" or finite numbers 0 <= tau_low < tau_high, got '
             f"{taus!r}"
         )
-    return low, high
+    return OodScore((low, high))
 
 
 def why_blocked(
@@ -328,8 +338,10 @@ def why_blocked(
     reasons = []
     for name, (part, at) in parts.items():
         # Of whole steps: what f or w_ood is worst at on the way closes the cell as well.
-        whole = part.closed(part.f), part.closed(part.ood())
-        F, f, w_ood = (values[at][open_headings] for values in (part.weighted(), *whole))
+        F, f, w_ood = (
+            values[at][open_headings]
+            for values in (part.weighted(), part.closed(part.f), part.closed(part.ood()))
+        )
         best = int(F.argmax())
         towards = headings.names[open_headings[best]]
         if F[best] >= f_min:

@@ -23,6 +23,7 @@ from fgtutor.baselines import (
 )
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
+from fgtutor.feasibility import OodScore
 from fgtutor.planning import PAPER, Refusal
 from fgtutor.tensorization import Assessment, assess_all, tensorize
 
@@ -153,7 +154,7 @@ def test_an_assessed_map_gives_what_tensorize_gives_and_computes_it_once(assesse
 def by_hand(elevation, f, reconstruction):
     """Return an assessment by `TAUS` of constants, or of one number per heading."""
     shape = (*elevation.shape, 8)
-    return Assessment(f.expand(shape), reconstruction.expand(shape), elevation, TAUS)
+    return Assessment(f.expand(shape), reconstruction.expand(shape), elevation, OodScore(TAUS))
 
 
 @pytest.fixture

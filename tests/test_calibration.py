@@ -30,12 +30,11 @@ def results(config):
     return evaluate(config)
 
 
-def test_a_drive_pairs_predictions_with_what_followed(make_rolling, config):
-    driven = drive(make_rolling("flat", f=0.8), "flat", config)
-    assert len(driven.predicted) == len(driven.measured) == len(driven.patch) > 100
-    assert driven.predicted == pytest.approx(0.8, abs=1e-5)
+def test_a_drive_pairs_patches_with_what_followed(make_rolling, config):
+    driven = drive(make_rolling("flat"), "flat", config)
+    assert len(driven.label) == len(driven.command) == len(driven.patch) > 100
     # Rolling on flat ground tracks well; r_v is never above 1.
-    assert 0.6 < driven.measured.mean() < 1.0 and driven.measured.max() <= 1.0
+    assert 0.6 < driven.label.mean() < 1.0 and driven.label.max() <= 1.0
 
 
 def test_a_net_that_promises_too_much_is_found_out(results):
@@ -92,8 +91,8 @@ def test_what_cannot_be_checked_is_refused():
 def test_the_a1_s_shipped_specialists_can_be_checked():
     steps = load_zoo("a1")["steps"]
     driven = drive(steps, "steps", CalibrationConfig(robot="a1", envs=2, seconds=1.6))
-    assert len(driven.predicted) == len(driven.measured) > 20
-    assert driven.measured.min() >= 0 and driven.predicted.std() > 0
+    assert len(driven.patch) == len(driven.command) == len(driven.label) > 20
+    assert driven.label.min() >= 0 and steps.feasibility.reconstruction(driven.patch).std() > 0
 
 
 def test_a_drive_is_under_the_conditions_asked_for(make_rolling, config):
@@ -102,5 +101,5 @@ def test_a_drive_is_under_the_conditions_asked_for(make_rolling, config):
         drive(rolling, "flat", replace(config, conditions=name))
         for name in ("training", "undisturbed", "disturbed")
     )
-    assert (training.measured == same.measured).all()  # a toy is not disturbed in training
-    assert (training.measured != other.measured).any()
+    assert (training.label == same.label).all()  # a toy is not disturbed in training
+    assert (training.label != other.label).any()

@@ -446,11 +446,13 @@ LEAVES = [
     ),
     *(("policy", "distribution", "std_range"), ("policy", "distribution", "std_range", 1)),
     *(("feasibility", k) for k in ("num_points", "command_dim", "hidden", "vae_hidden")),
-    *(("feasibility", "latent"), ("feasibility", "height_scale"), ("feasibility", "hidden", 1)),
+    *(("feasibility", k) for k in ("latent", "height_scale", "saturation")),
+    ("feasibility", "hidden", 1),
+    ("strangeness", "0.9"),
     *(("grid", k) for k in ("ahead", "behind", "half_width", "spacing", "footprint")),
     *(("grid", "footprint", 0), ("command", 0), ("command", 2), ("quantiles", "0.9")),
     *((k,) for k in ("schema", "name", "robot", "policy", "feasibility", "grid", "command")),
-    *((k,) for k in ("label_seconds", "quantiles", "provenance", "files")),
+    *((k,) for k in ("label_seconds", "quantiles", "strangeness", "provenance", "files")),
     *(("files", "policy.safetensors"), ("files", "policy.safetensors", "bytes")),
     *(("files", "policy.safetensors", "sha256"), ("provenance", "terrain")),
     ("provenance", "samples"),
@@ -465,7 +467,8 @@ def test_every_value_of_a_description_is_tried(make_specialist, tmp_path):
     tried = {tuple(0 if isinstance(key, int) else key for key in path) for path in LEAVES}
     free = {("checksum",), ("provenance", "seed")}
     alike = {("files", "feasibility.safetensors", *path[2:]) for path in tried if len(path) > 1}
-    missing = {path for path in kinds - tried - free - alike if path[0] != "quantiles"}
+    levels = ("quantiles", "strangeness")
+    missing = {path for path in kinds - tried - free - alike if path[0] not in levels}
     assert missing == {("feasibility", "vae_hidden", 0)}  # as ("feasibility", "hidden", 0)
 
 

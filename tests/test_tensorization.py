@@ -16,7 +16,7 @@ from fgtutor.patches import PatchGrid
 from fgtutor.tensorization import (
     assess,
     assess_all,
-    resolve_taus,
+    ood_score,
     tensorize,
     why_blocked,
 )
@@ -209,10 +209,12 @@ def test_tensorize_weighs_f_by_familiarity(make_specialist):
 
 
 def test_taus_by_name_and_by_number(make_specialist):
-    specialist = make_specialist(quantiles={"0.9": 0.2, "0.99": 1.0})
-    assert resolve_taus("paper", specialist) == (0.1, 2.0)
-    assert resolve_taus("calibrated", specialist) == (0.2, 2.0)
-    assert resolve_taus((0.3, 0.4), specialist) == (0.3, 0.4)
+    own = {"0.9": 0.2, "0.99": 1.0}
+    specialist = make_specialist(quantiles=own, strangeness=own)
+    assert ood_score("paper", specialist).taus == (0.1, 2.0)
+    assert ood_score((0.3, 0.4), specialist).taus == (0.3, 0.4)
+    ours = ood_score("calibrated", specialist)
+    assert ours.taus is None and ours.own == (own, own)
 
 
 def test_settings_that_cannot_work_are_refused(make_specialist):
@@ -281,8 +283,8 @@ def test_why_blocked_shows_places_to_the_cell_far_from_the_origin(make_specialis
 
 def test_a_map_too_large_for_the_memory_left_is_refused(make_specialist, monkeypatch):
     monkeypatch.setattr(machine, "ALWAYS_LEFT", 0)
-    monkeypatch.setattr(machine, "available_memory", lambda: 19_000)
-    with pytest.raises(TooLargeError, match=r"10 x 20 cells for 1 policy needs about 1.92e-05 GB"):
+    monkeypatch.setattr(machine, "available_memory", lambda: 25_000)
+    with pytest.raises(TooLargeError, match=r"10 x 20 cells for 1 policy needs about 2.56e-05 GB"):
         tensorize(rough(10, 20), make_specialist())
 
 

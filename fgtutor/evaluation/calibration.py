@@ -7,29 +7,27 @@ Source: paper, Sec. III-A (feasibility is predicted r_v) and Eq. 4.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal, TypedDict
 
 import numpy as np
 import torch
 from annotated_types import Interval
-from jaxtyping import Float
-from torch import Tensor
 
 from fgtutor.errors import ConfigError
 from fgtutor.evaluation.report import Findings, markdown, run_and_report
 from fgtutor.evaluation.shards import settings_of
 from fgtutor.evaluation.tasks import Task
 from fgtutor.evaluation.trials import ZooConfig
-from fgtutor.feasibility import feasibility_labels, ood_weight
 from fgtutor.io.validation import NonNegative
-from fgtutor.robots import condition_of, env_class
+from fgtutor.learning.calibrate import RELIEF, Rollout, roll_out
+from fgtutor.robots import condition_of
 from fgtutor.robots.conditions import Condition
 from fgtutor.settings import SETTINGS, Taus
 from fgtutor.specialist import Specialist, load_zoo
 from fgtutor.statistics import calibration
-from fgtutor.tensorization import resolve_taus
-from fgtutor.world.terrain import World, make_terrain
+from fgtutor.tensorization import ood_score
+from fgtutor.world.terrain import make_terrain
 
 COMMAND = "evaluate calibration"
 
@@ -49,7 +47,7 @@ class CalibrationConfig(ZooConfig):
     conditions: Literal["training", "undisturbed", "disturbed"] = "training"
     """What is amiss on the drive: what the environment draws in training, nothing, or the robot's
     preset of disturbances."""
-    relief: NonNegative = 0.06
+    relief: NonNegative = RELIEF
     """A patch with at least this difference of heights is distinctive of its terrain, m."""
 
     @property
@@ -67,18 +65,6 @@ class CalibrationConfig(ZooConfig):
         return load_zoo(self.robot, self.home)
 
 
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """What one specialist met on held-out terrain of its own kind."""
-
-    patch: Float[Tensor, "n points"]
-    """The patches under it, m."""
-    predicted: Float[np.ndarray, "n"]
-    """Its Feasibility-Net's f there."""
-    measured: Float[np.ndarray, "n"]
-    """The mean r_v that followed."""
-
-
 class CalibrationRow(TypedDict):
     """What a report keeps of one specialist's drive."""
 
@@ -93,8 +79,7 @@ class CalibrationRow(TypedDict):
     the others of the distinctive ones, of which flat ground has none."""
 
 
-@torch.no_grad()
-def drive(specialist: Specialist, terrain: str, config: CalibrationConfig) -> Drive:
+def drive(specialist: Specialist, terrain: str, config: CalibrationConfig) -> Rollout:
     """Drive a specialist over held-out terrains of full difficulty, with deterministic actions.
 
     Places, headings and commands are drawn as in training; terrain seeds are odd, as never there.
@@ -103,25 +88,13 @@ def drive(specialist: Specialist, terrain: str, config: CalibrationConfig) -> Dr
         make_terrain(terrain, robot=config.robot, seed=2 * (config.seed * 10_000 + i) + 1)
         for i in range(config.envs)
     ]
-    robot = env_class(config.robot)
-    episodes = replace(robot.episodes, history=specialist.history)
     options = config.condition.options if config.condition else {}
-    env = robot(World([tiles]), config.envs, config=episodes, seed=config.seed + 1, **options)
-    observations = env.get_observations()
-    seen: dict[str, list[Tensor]] = {"tracking": [], "patch": [], "command": []}
-    for _ in range(round(config.seconds / env.control_dt)):
-        for name, values in seen.items():
-            values.append(observations[name])
-        observations, *_ = env.step(specialist.act(observations))
-    rollout = {name: torch.stack(values) for name, values in seen.items()}
-    label, valid = feasibility_labels(
-        rollout["tracking"], round(specialist.label_seconds / env.control_dt)
+    return roll_out(
+        specialist, tiles, config.envs, config.seconds, seed=config.seed + 1, options=options
     )
-    patch, command = rollout["patch"][valid], rollout["command"][valid]
-    predicted = specialist.feasibility.feasibility(patch, command)
-    return Drive(patch, predicted.numpy(), label[valid].numpy())
 
 
+@torch.no_grad()
 def run_task(config: CalibrationConfig, name: str) -> list[CalibrationRow]:
     """Do one task: drive one specialist, and ask the Feasibility-Nets of all about what it met."""
     zoo = config.load_zoo()
@@ -133,17 +106,15 @@ def run_task(config: CalibrationConfig, name: str) -> list[CalibrationRow]:
         patch = driven.patch if other == name else distinctive
         if not len(patch):
             return None
-        with torch.inference_mode():
-            loss = zoo[other].feasibility.reconstruction(patch)
-        return round(
-            ood_weight(loss, *resolve_taus(config.thresholds, zoo[other])).mean().item(), 4
-        )
+        score = ood_score(config.thresholds, zoo[other])
+        return round(score.weight(*zoo[other].feasibility.losses(patch)).mean().item(), 4)
 
-    bins, error = calibration(driven.predicted, driven.measured)
+    f = zoo[name].feasibility.feasibility(driven.patch, driven.command)
+    bins, error = calibration(f.numpy(), driven.label.numpy())
     return [
         {
             "specialist": name,
-            "samples": len(driven.measured),
+            "samples": len(driven.label),
             "calibration_error": round(error, 4),
             "calibration": [[None if np.isnan(v) else round(float(v), 4) for v in b] for b in bins],
             "w_ood": {other: weight(other) for other in zoo},
@@ -174,7 +145,7 @@ def run(config: CalibrationConfig) -> int:
 
     def find(rows: list[CalibrationRow]) -> Findings:
         samples = min(row["samples"] for row in rows)
-        amiss = config.told(config.condition) if config.condition else "as amiss as in training"
+        amiss = config.told(config.condition) if config.condition else "as disturbed as in training"
         caption = (
             f"At least {samples:,} labelled patches each; robot {config.robot}, tau "
             f"{config.thresholds}, seed {config.seed}; {amiss}."

@@ -13,7 +13,7 @@ import sys
 import types
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr
-from dataclasses import fields, is_dataclass, make_dataclass
+from dataclasses import field, fields, is_dataclass, make_dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -189,15 +189,18 @@ def read_record(kind: type[T], path: str | Path, error: type[FgtutorError]) -> T
 def arguments(kind: type, base: type = object) -> type:
     """Return a record of what a class takes beyond `base`: its arguments that are numbers.
 
-    So a file can say how to build it, and nothing else; `Literal` words count as numbers here.
+    So a file can say how to build it, and nothing else; `Literal` words count as numbers here. What
+    is None by default may be missing.
     """
     known = inspect.signature(base).parameters
+    optional = {k for k, v in inspect.signature(kind).parameters.items() if v.default is None}
     hints = {}
     for part in kind.__mro__:
         if part is not base and issubclass(part, base) and "__init__" in part.__dict__:
             own = get_type_hints(part.__init__, include_extras=True)
             hints = {k: v for k, v in own.items() if k not in known and _is_plain(v)} | hints
-    return make_dataclass(kind.__name__, hints.items(), frozen=True, kw_only=True)
+    members = ((k, v, field(default=None) if k in optional else field()) for k, v in hints.items())
+    return make_dataclass(kind.__name__, members, frozen=True, kw_only=True)
 
 
 @cache

@@ -19,6 +19,7 @@ from tqdm import tqdm
 from fgtutor.errors import CheckpointError
 from fgtutor.io.storage import locked_folder, storage_error
 from fgtutor.learning import distributed
+from fgtutor.learning.calibrate import CalibrateConfig, calibrated
 from fgtutor.learning.config import TrainConfig, config_of, training_world
 from fgtutor.learning.distributed import leads
 from fgtutor.learning.trainer import CHECKPOINT, Trainer
@@ -90,8 +91,21 @@ def _train(
             raise
         specialist = trainer.specialist()
         if leads():
+            if not interrupted:
+                specialist = calibrated(specialist, _calibration(config, trainer.env.control_dt))
             save_specialist(specialist, config.folder / "specialist")
         return specialist, interrupted
+
+
+def _calibration(config: TrainConfig, dt: float) -> CalibrateConfig:
+    """Return how a finished run is calibrated: at length, but not for longer than it trained."""
+    trained = config.iterations * config.steps * dt
+    return CalibrateConfig(
+        folder=config.folder,
+        envs=min(CalibrateConfig.envs, config.num_envs),
+        seconds=min(CalibrateConfig.seconds, trained),
+        seed=config.seed,
+    )
 
 
 def _iterate(

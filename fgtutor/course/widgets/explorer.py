@@ -113,7 +113,7 @@ class Explorer:
             raise ConfigError(f"no policy {', '.join(unknown)}; there are {', '.join(self.names)}")
         weights, tensors = {}, []
         for name, one in self.assessments.items():
-            taus = _thresholds(settings, one)
+            taus = _thresholds(settings)
             weights[name], tensor = one.weigh(*taus, unknown=settings.unknown)
             tensors.append(tensor * (name in policies))
         fused, policy_map = fuse(tensors)
@@ -176,8 +176,8 @@ class Explorer:
         return cell_table(self.elevation, cell, Headings(self.settings.headings), rows)
 
 
-def _thresholds(settings: PlanSettings, assessment: Assessment) -> tuple[float, float]:
-    """Return (tau_low, tau_high) for one policy."""
+def _thresholds(settings: PlanSettings) -> tuple[float, ...]:
+    """Return (tau_low, tau_high) for all policies, or nothing: by each policy's own calibration."""
     if settings.taus == "calibrated":
-        return assessment.taus
+        return ()
     return (TAU_LOW, TAU_HIGH) if settings.taus == "paper" else settings.taus
