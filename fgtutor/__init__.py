@@ -4,9 +4,9 @@
                      |                                    |
                      +----------------+-------------------+
                                       v
-         assess      f [nx, ny, 8] and L_recon [nx, ny, 8], per specialist       (paper, Eqs. 2-3)
-         tensorize   F_i = f * w_ood(L_recon)  [nx, ny, 8]                       (Eqs. 4-5)
-         fuse        F_max = max_i F_i,  P = argmax_i F_i  [nx, ny, 8]           (Eqs. 6-7)
+         assess      f [nx, ny, d] and L_recon [nx, ny, d], per specialist       (paper, Eqs. 2-3)
+         tensorize   F_i = f * w_ood(L_recon)  [nx, ny, d]                       (Eqs. 4-5)
+         fuse        F_max = max_i F_i,  P = argmax_i F_i  [nx, ny, d]           (Eqs. 6-7)
          plan        Dijkstra over edges of cost 1 / F_max  -->  Route           (Sec. III-C)
          execute     follow the Route, the active policy being P  -->  Episode   (Sec. III-C)
 

@@ -216,7 +216,7 @@ compare_routes(M, {"the paper's settings": route, "ours: a switch costs 1": calm
 # ## The paper in one file
 #
 # Notebooks 04 to 06 are Secs. III-B and III-C of the paper. Written down as it says, slowly and
-# without any of our tricks, they fit into 69 lines: `fgtutor/paper.py`. Read it from top to bottom
+# without any of our tricks, they fit into 91 lines: `fgtutor/paper.py`. Read it from top to bottom
 # once; you know every line of it by now. Here is its last function. Does it agree with the fast
 # way? It asks for one patch after the other, so a part of the map will do: from the start into the
 # gap lane.
