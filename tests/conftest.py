@@ -64,10 +64,10 @@ def make_specialist() -> Callable[..., Specialist]:
             "command": (0.6, 0.0, 0.0),
             "label_seconds": 1.0,
             "quantiles": {"0.5": 0.05, "0.9": 0.1, "0.95": 0.2, "0.99": 0.4},
-            "strangeness": {"0.5": 0.05, "0.9": 0.1, "0.95": 0.2, "0.99": 0.4},
             "provenance": {"terrain": name, "samples": 1000, "seed": seed},
         }
-        return Specialist(**(values | fields))
+        values |= fields
+        return Specialist(**({"strangeness": values["quantiles"]} | values))
 
     return make
 
@@ -102,7 +102,6 @@ def make_rolling(make_specialist) -> Callable[..., Specialist]:
             "feasibility": net,
             "command": (0.85, 0.0, 0.0),
             "quantiles": {"0.5": 1.0, "0.9": 9e3, "0.95": 9.5e3, "0.99": 9.9e3},
-            "strangeness": {"0.5": 1.0, "0.9": 9e3, "0.95": 9.5e3, "0.99": 9.9e3},
         }
         return make_specialist(name, **(values | fields))
 
