@@ -25,7 +25,7 @@ from fgtutor.io.validation import Width
 
 HeightScale = Annotated[float, Interval(gt=0, le=1000)]
 """Units of height per metre."""
-Saturation = Annotated[float, Interval(gt=0, le=100)]
+Saturation = Annotated[float, Interval(ge=1e-3, le=100)]
 """Difference of heights beyond which the autoencoder hardly tells more from less, m."""
 TAU_LOW, TAU_HIGH = 0.1, 2.0
 """The paper's thresholds on L_recon, summed over the patch (Eq. 4)."""

@@ -79,8 +79,8 @@ class Specialist:
     """Quantiles of L_recon on its own terrain, in the Feasibility-Net's scaled units, by
     probability ("0.95": ...)."""
     strangeness: Mapping[str, float] = field(default_factory=dict)
-    """Quantiles of the strangeness (`FeasibilityNet.losses`) on its own held-out terrain; none if it
-    was never calibrated (`fgtutor calibrate`)."""
+    """Quantiles of the strangeness (`FeasibilityNet.losses`) on its own held-out terrain; none if
+    it was never calibrated (`fgtutor calibrate`)."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """Where it came from: terrain, samples, seed, package versions; kept as JSON keeps it."""
 

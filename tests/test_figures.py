@@ -171,7 +171,7 @@ def test_a_petal_points_along_its_heading_and_is_as_long_as_f():
     tip = petal.vertices[petal.vertices[:, 1].argmax()]
     # Centre (1.5, 1.5), and a petal of F = 1 reaches 0.56 cells far.
     assert tip == pytest.approx((1.5, 1.5 + 0.5 * 0.56))
-    np.testing.assert_allclose(petals.get_facecolor()[0, :3], to_rgb(maps.HEADING_COLOURS[2]))
+    np.testing.assert_allclose(petals.get_facecolor()[0, :3], to_rgb(style.HEADING_COLOURS[2]))
 
 
 def test_petals_turn_with_the_map():

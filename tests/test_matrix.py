@@ -224,6 +224,7 @@ def test_a_trial_says_what_was_planned_and_how_it_ended(make_rolling):
     assert trial.row == {
         "terrain": "flat", "policy": "ours", "ground": 1, "seed": 1, "outcome": "reached",
         "length": trial.length, "seconds": round(trial.episode.seconds, 3), "switches": 0,
+        "promise": round(trial.route.promise, 4),
     }  # fmt: skip
     (refused,) = drive([ground], {"ours": ours}, zoo, settings=PlanSettings(f_min=0.99))
     assert (refused.route, refused.episode, refused.outcome) == (None, None, "no_route")

@@ -23,6 +23,7 @@ from fgtutor.world.scanning import ScanConfig
 
 NEEDED: dict[str, Any] = {
     "map": Path("map.npz"),
+    "folder": Path("specialist"),
     "cloud": Path("cloud.las"),
     "paths": (Path("ex01.ipynb"),),
     "start": (0.0, 0.0),
@@ -39,7 +40,8 @@ SENSE = {
     **dict.fromkeys(("critic_warmup", "difficulty"), ZERO),
     **dict.fromkeys(("easiest", "easiest_at_last", "entropy", "f_min", "gamma", "heights"), ZERO),
     **dict.fromkeys(("label_seconds", "levels", "neighbours", "seed"), ZERO),
-    **dict.fromkeys(("seeds", "workers"), ZERO),
+    **dict.fromkeys(("seeds", "workers", "turned", "updates"), ZERO),
+    "angles": ZERO + BELOW,
 }
 """Which unusual values make sense, by the field's name; all others are refused."""
 

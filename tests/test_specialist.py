@@ -501,8 +501,9 @@ def test_a_value_of_another_kind_is_refused_or_means_the_same(make_specialist, t
         assert repr(loaded) and torch.isfinite(loaded.act(seen)).all()
         patch, command = torch.zeros(1, loaded.grid.num_points), torch.tensor([loaded.command])
         assert torch.isfinite(loaded.feasibility.feasibility(patch, command)).all()
-        assert value == before or path[0] in ("label_seconds", "quantiles", "provenance", "name",
-            "robot", "grid", "command") or path[-1] in ("height_scale", "groups", 0, 1)  # fmt: skip
+        free = ("label_seconds", "quantiles", "strangeness", "provenance", "name", "robot", "grid")
+        scales = ("height_scale", "saturation", "groups", 0, 1)
+        assert value == before or path[0] in (*free, "command") or path[-1] in scales
 
 
 def hostile(description, marker) -> None:

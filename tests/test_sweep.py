@@ -350,7 +350,9 @@ def test_more_seeds_and_values_in_the_same_folder_train_only_the_new(config, mon
 def test_a_generalist_crosses_every_kind(config):
     config = replace(config, terrains=("general",), seeds=(1,), trials=5)
     ((_, result),) = run_tasks(make_tasks(config), workers=1)
-    assert [row["terrain"] for row in result.rows] == ["steps", "gaps", "slopes", "rubble", "steps"]
+    # What the plan refuses comes first.
+    crossed = sorted(row["terrain"] for row in result.rows)
+    assert crossed == ["gaps", "rubble", "slopes", "steps", "steps"]
     assert {row["policy"] for row in result.rows} == {"general"}
 
 

@@ -13,6 +13,7 @@ from typing import Annotated, Literal, TypedDict
 import numpy as np
 import torch
 from annotated_types import Interval
+from jaxtyping import Float
 
 from fgtutor.errors import ConfigError
 from fgtutor.evaluation.report import Findings, markdown, run_and_report
@@ -95,6 +96,15 @@ def drive(specialist: Specialist, terrain: str, config: CalibrationConfig) -> Ro
 
 
 @torch.no_grad()
+def promised(
+    specialist: Specialist, driven: Rollout
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return f of every patch that was met, and the mean r_v that followed."""
+    f = specialist.feasibility.feasibility(driven.patch, driven.command)
+    return f.numpy(), driven.label.numpy()
+
+
+@torch.no_grad()
 def run_task(config: CalibrationConfig, name: str) -> list[CalibrationRow]:
     """Do one task: drive one specialist, and ask the Feasibility-Nets of all about what it met."""
     zoo = config.load_zoo()
@@ -109,8 +119,7 @@ def run_task(config: CalibrationConfig, name: str) -> list[CalibrationRow]:
         score = ood_score(config.thresholds, zoo[other])
         return round(score.weight(*zoo[other].feasibility.losses(patch)).mean().item(), 4)
 
-    f = zoo[name].feasibility.feasibility(driven.patch, driven.command)
-    bins, error = calibration(f.numpy(), driven.label.numpy())
+    bins, error = calibration(*promised(zoo[name], driven))
     return [
         {
             "specialist": name,

@@ -209,8 +209,9 @@ def _crossings(specialist: Specialist, config: TrainConfig, trials: int, known: 
     kinds = ROBOTS[robot].scale.mixed if terrain == GENERAL else (terrain,)
     free = CalibrationConfig(robot=robot, envs=trials)
     drives = [calibration.drive(specialist, kind, free) for kind in kinds]
-    measured = np.concatenate([drive.measured for drive in drives])
-    _, error = compare(np.concatenate([drive.predicted for drive in drives]), measured)
+    each = (calibration.promised(specialist, driven) for driven in drives)
+    predicted, measured = map(np.concatenate, zip(*each, strict=True))
+    _, error = compare(predicted, measured)
     known |= {"r_v": round(float(measured.mean()), 4), "calibration_error": round(error, 4)}
     crossings = TrialsConfig(robot=robot, trials=trials)
     planned = {specialist.name: partial(single, specialist.name)}

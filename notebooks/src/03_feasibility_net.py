@@ -279,11 +279,11 @@ training_curve(steps.provenance["curve"])
 # terrain:
 
 # %%
-from fgtutor.evaluation.calibration import CalibrationConfig, drive
+from fgtutor.evaluation.calibration import CalibrationConfig, drive, promised
 
 settings = CalibrationConfig(envs=budget(fast=40, full=100, unit="robots", each=0.2), seconds=10.0)
 held_out = drive(steps, "steps", settings)
-calibration_plot(*calibration(held_out.predicted, held_out.measured))
+calibration_plot(*calibration(*promised(steps, held_out)))
 
 # %% [markdown]
 # ## What to try

@@ -265,13 +265,13 @@ draw_rates(passed, title="Who crosses steps it has never seen?")
 # a rollout on held-out ground, labels, and a plot of promise against deed.
 
 # %%
-from fgtutor.evaluation.calibration import CalibrationConfig, drive
+from fgtutor.evaluation.calibration import CalibrationConfig, drive, promised
 from fgtutor.figures.charts import calibration_plot
 from fgtutor.statistics import calibration
 
 envs = budget(fast=16, full=80, unit="robots, 5 s each", each=0.5)
 exam = drive(steps, "steps", CalibrationConfig(robot="a1", envs=envs, seconds=5.0))
-calibration_plot(*calibration(exam.predicted, exam.measured))
+calibration_plot(*calibration(*promised(steps, exam)))
 
 # %% [markdown]
 # *What to see:* do the points lie near the diagonal where many patches are (the bars below)? That
