@@ -5,7 +5,7 @@
 #   make lab        JupyterLab on the first notebook, on this machine only
 #   make notebooks  execute the notebooks' sources     make exercises  build them from their masters
 #   make test-wheel install wheel and source archive into fresh environments of each Python, and use them
-#   make bench      every benchmark, about half an hour     make bench-quick  under three minutes
+#   make bench      every benchmark, for an idle machine    make bench-quick  smaller sizes of each
 #   make check      lint, types, imports
 #   make clean      remove what the targets made (.venv too)
 # PYTHON=/path/to/python chooses the interpreter for .venv (3.11 to 3.14).

@@ -128,7 +128,9 @@ class Route:
 
         The product over its steps of exp(-l exp(`HAZARD` - `RELIEF` F)), l being a step's metres:
         the lower F, the more walks end per metre. F itself is no probability of passing a step but
-        a tracking reward, and a product of them falls to 0 on every long route.
+        a tracking reward, and a product of them falls to 0 on every long route. It was fitted to
+        the A1; of 204 drives of the toy, 29 of which failed, it ranked those hardly better than
+        chance.
         """
         lengths = np.hypot(*np.diff(self.xy, axis=0).T)
         ends = lengths * np.exp(HAZARD - RELIEF * self.feasibility)

@@ -290,8 +290,8 @@ def _assess_tiles(
 def ood_score(taus: Taus, specialist: Specialist) -> OodScore:
     """Return what w_ood follows from: the specialist's calibration, or thresholds on L_recon.
 
-    Raises `ThresholdError` for another name, unless 0 <= tau_low < tau_high, both finite, and for
-    "calibrated" if the specialist was never calibrated.
+    A specialist that was never calibrated has thresholds from the quantiles of its training. Raises
+    `ThresholdError` for another name, and unless 0 <= tau_low < tau_high, both finite.
     """
     if taus == "paper":
         return OodScore()

@@ -8,6 +8,7 @@ import torch
 
 from fgtutor.errors import ThresholdError
 from fgtutor.feasibility import FeasibilityNet, OodScore, ood_weight
+from fgtutor.learning import training
 from fgtutor.learning.calibrate import (
     CalibrateConfig,
     calibrated,
@@ -15,6 +16,7 @@ from fgtutor.learning.calibrate import (
     quantiles_on,
     with_new_autoencoder,
 )
+from fgtutor.learning.training import TrainConfig, train
 from fgtutor.specialist import load_specialist, save_specialist
 from fgtutor.tensorization import assess, ood_score
 
@@ -123,6 +125,19 @@ def test_a_new_autoencoder_knows_its_terrain_better(make_rolling, config):
     fresh = FeasibilityNet(net.num_points, vae_hidden=(16, 8), latent=3, saturation=0.2)
     flat = torch.zeros(1, net.num_points)
     assert net.reconstruction(flat) < fresh.reconstruction(flat)
+
+
+def test_a_finished_training_is_safe_before_it_is_calibrated(tmp_path, monkeypatch):
+    def stopped(specialist, config):
+        assert load_specialist(tmp_path / "specialist").name == "flat"
+        assert not specialist.policy.training  # what was written, not what learns
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training, "calibrated", stopped)
+    config = TrainConfig(terrain="flat", out=tmp_path, iterations=1, num_envs=4, steps=26)
+    with pytest.raises(KeyboardInterrupt):
+        train(config)
+    assert load_specialist(tmp_path / "specialist").strangeness == {}
 
 
 def test_fitting_leaves_the_head_alone():

@@ -14,7 +14,6 @@ from typing import Annotated, Any
 from annotated_types import Interval
 
 from fgtutor.baselines import OURS, planners
-from fgtutor.errors import ConfigError
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report, shares_chart
 from fgtutor.evaluation.success import Trials, cut, terrain_seed
@@ -33,7 +32,7 @@ from fgtutor.evaluation.trials import (
 from fgtutor.execution import FollowConfig
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.io.validation import Unique
-from fgtutor.robots import ROBOTS, conditions_of
+from fgtutor.robots import ROBOTS, conditions_of, never_disturbed
 from fgtutor.robots.conditions import Axis, Condition
 from fgtutor.statistics import Share
 from fgtutor.world.terrain import Terrain, make_terrain
@@ -81,11 +80,7 @@ def axes(config: RobustnessConfig) -> dict[str, Axis]:
     """
     known = conditions_of(config.robot)
     if not known.axes:
-        able = [name for name in ROBOTS if conditions_of(name).axes]
-        raise ConfigError(
-            f"nothing is known of disturbances of {config.robot}; choose a robot of "
-            f"{', '.join(able)}, or give its entry `conditions`"
-        )
+        raise never_disturbed(config.robot)
     names = choose("axis", config.axes, known.axes)
     free = Axis(levels={"-": known.undisturbed})
     return {NOTHING: free, **{name: known.axes[name] for name in names}}

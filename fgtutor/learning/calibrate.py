@@ -30,7 +30,7 @@ from fgtutor.feasibility import (
 from fgtutor.io.progress import watch
 from fgtutor.io.validation import Count, CountOrZero, Seed, Width, check_fields
 from fgtutor.robots import ROBOTS, env_class
-from fgtutor.specialist import Specialist, load_specialist, save_specialist
+from fgtutor.specialist import GENERAL, Specialist, load_specialist, save_specialist
 from fgtutor.world.terrain import Terrain, World, make_terrain
 
 HELD_OUT = 2**40
@@ -149,7 +149,7 @@ def own_terrain(
     rng = np.random.default_rng(first)
     return [
         make_terrain(
-            mixed[i % len(mixed)] if kind == "general" else kind,
+            mixed[i % len(mixed)] if kind == GENERAL else kind,
             robot=specialist.robot,
             difficulty=float(rng.uniform(easiest, 1.0)),
             seed=first + 2 * i,
@@ -164,12 +164,14 @@ def quantiles_on(
     net: FeasibilityNet, patch: Float[Tensor, "n points"]
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the quantiles `LEVELS` of L_recon and of the strangeness over patches."""
-    parts = zip(*(net.losses(part) for part in patch.split(8192)), strict=True)
-    levels = torch.tensor(LEVELS)
-    return tuple(  # type: ignore[return-value]
-        {str(q): value for q, value in zip(LEVELS, torch.quantile(x, levels).tolist(), strict=True)}
-        for x in (torch.cat(values) for values in parts)
-    )
+    each = zip(*(net.losses(part) for part in patch.split(8192)), strict=True)
+    loss, strangeness = map(torch.cat, each)
+
+    def quantiles(values: Float[Tensor, " n"]) -> dict[str, float]:
+        found = torch.quantile(values, torch.tensor(LEVELS)).tolist()
+        return {str(level): value for level, value in zip(LEVELS, found, strict=True)}
+
+    return quantiles(loss), quantiles(strangeness)
 
 
 def fit_autoencoder(

@@ -24,7 +24,7 @@ from fgtutor.learning.config import TrainConfig, config_of, training_world
 from fgtutor.learning.distributed import leads
 from fgtutor.learning.trainer import CHECKPOINT, Trainer
 from fgtutor.robots import env_class
-from fgtutor.specialist import Specialist, save_specialist
+from fgtutor.specialist import Specialist, load_specialist, save_specialist
 
 __all__ = ["TrainConfig", "Trainer", "config_of", "run", "train"]
 
@@ -91,9 +91,12 @@ def _train(
             raise
         specialist = trainer.specialist()
         if leads():
+            folder = save_specialist(specialist, config.folder / "specialist")
             if not interrupted:
-                specialist = calibrated(specialist, _calibration(config, trainer.env.control_dt))
-            save_specialist(specialist, config.folder / "specialist")
+                # Loaded again: it drives on the CPU, wherever it was trained, and is safe by now.
+                own = _calibration(config, trainer.env.control_dt)
+                specialist = calibrated(load_specialist(folder), own)
+                save_specialist(specialist, folder)
         return specialist, interrupted
 
 

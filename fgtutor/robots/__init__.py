@@ -99,12 +99,17 @@ def condition_of(robot: str, name: Literal["undisturbed", "disturbed"]) -> Condi
     """Return one of a robot's two presets; raises `ConfigError` if it cannot be disturbed."""
     known = getattr(conditions_of(robot), name)
     if known is None:
-        able = [other for other in ROBOTS if conditions_of(other).disturbed]
-        raise ConfigError(
-            f"nothing is known of disturbances of {robot}; choose a robot of {', '.join(able)}, or "
-            "give its entry `conditions`"
-        )
+        raise never_disturbed(robot)
     return known
+
+
+def never_disturbed(robot: str) -> ConfigError:
+    """Return the error of a robot that cannot be disturbed: it says which ones can."""
+    able = [name for name, entry in ROBOTS.items() if entry.conditions]
+    return ConfigError(
+        f"nothing is known of disturbances of {robot}; choose a robot of {', '.join(able)}, or "
+        "give its entry `conditions`"
+    )
 
 
 def load(place: str) -> Any:

@@ -288,11 +288,11 @@ class _Layout:
         """Lay patches of natural ground beside what lies between two x; return where they lie."""
         snap, patches = self.course.snap, []
         side = min(PATCH, snap(far - near - 0.4) // COLUMN * COLUMN)
+        if side < 1.0:
+            return patches
         taken = [(low - 0.2, high + 0.2) for _, _, low, high in things]
-        x = snap(self.rng.uniform(near + 0.2, far - 0.2 - side)) if side >= 1.0 else 0.0
-        for y in (
-            np.arange(-self.inside + 0.3, self.inside - side, side + 1.0) if side >= 1.0 else ()
-        ):
+        x = snap(self.rng.uniform(near + 0.2, far - 0.2 - side))
+        for y in np.arange(-self.inside + 0.3, self.inside - side, side + 1.0):
             low = snap(float(y))
             if any(low < end and begin < low + side for begin, end in taken):
                 continue

@@ -159,8 +159,10 @@ def make_terrain(
     if resolution is not None:
         scale = replace(scale, resolution=resolution)
     rng = np.random.default_rng((seed, TERRAINS.index(name)))
-    other = np.random.default_rng((seed, TERRAINS.index(name), 1))
-    course = Course(scale, difficulty, rng, other if unlike and name != "mixed" else None)
+    other = None
+    if unlike and name != "mixed":
+        other = np.random.default_rng((seed, TERRAINS.index(name), 1))
+    course = Course(scale, difficulty, rng, other)
     sections: list[Section] = []
     lane: list[Point] = []
     apron, width = course.snap(scale.apron), course.snap(scale.width)

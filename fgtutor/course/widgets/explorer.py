@@ -111,9 +111,8 @@ class Explorer:
         unknown = [name for name in policies if name not in self.names]
         if unknown:
             raise ConfigError(f"no policy {', '.join(unknown)}; there are {', '.join(self.names)}")
-        weights, tensors = {}, []
+        weights, tensors, taus = {}, [], _thresholds(settings)
         for name, one in self.assessments.items():
-            taus = _thresholds(settings)
             weights[name], tensor = one.weigh(*taus, unknown=settings.unknown)
             tensors.append(tensor * (name in policies))
         fused, policy_map = fuse(tensors)
