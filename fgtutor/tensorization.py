@@ -36,6 +36,10 @@ if TYPE_CHECKING:
     from fgtutor.specialist import Specialist
 
 
+CACHED = 2304
+"""Patches that the networks are asked about at once: as many as stay in a core's cache."""
+
+
 @dataclass(frozen=True, eq=False)
 class Assessment:
     """What one specialist says about every cell and heading of a map."""
@@ -265,26 +269,40 @@ def _assess_tiles(
     `work` says what a progress bar stands for; None shows none.
     """
     resolution = next((one.elevation.resolution for one in assessments.values()), 1.0)
-    yaws = next((one.headings.yaws for one in assessments.values()), ())
+    yaws = next((one.headings.yaws.tolist() for one in assessments.values()), [])
     cut = (
-        (grid, heading, tile, patch)
+        (grid, *one)
         for grid, some in tiles.items()
-        for heading, yaw in enumerate(yaws)
-        for tile, patch in WAYS[method](heights, yaw, grid, resolution, some)
+        for one in WAYS[method](heights, yaws, grid, resolution, some)
     )
-    total = len(yaws) * sum(map(len, tiles.values()))
+    total = sum(map(len, tiles.values()))
     shown = watch(cut, total, work or "", show=work is not None, unit="tile")
-    for grid, heading, (rows, columns), patch in shown:
-        distinct, cells = distinct_patches(patch)
-        for name, specialist in zoo.items():
-            if specialist.grid != grid:
-                continue
-            net, one = specialist.feasibility, assessments[name]
+    for grid, (rows, columns), patch in shown:
+        shape = len(yaws), rows.stop - rows.start, columns.stop - columns.start
+        distinct, which = distinct_patches(patch.flatten(0, 1))
+        team = {name: specialist for name, specialist in zoo.items() if specialist.grid == grid}
+        for name, found in _ask(team, distinct).items():
+            for values, whole in zip(found, assessments[name].said.values(), strict=True):
+                whole[rows, columns] = values[which].reshape(shape).movedim(0, -1)
+
+
+def _ask(
+    team: Mapping[str, Specialist], patch: Float[Tensor, "n points"]
+) -> dict[str, Float[Tensor, "3 n"]]:
+    """Return f, L_recon and the strangeness of patches, by each specialist."""
+    found = {name: torch.empty(3, len(patch)) for name in team}
+    for first in range(0, len(patch), CACHED):
+        part = patch[first : first + CACHED]
+        reliefs: dict[tuple[float, float | None], Tensor] = {}
+        for name, specialist in team.items():
+            net = specialist.feasibility
             command = torch.tensor(specialist.command, dtype=torch.float32)
-            f = net.feasibility(distinct, command.expand(len(distinct), -1))
-            found = f, *net.losses(distinct)
-            for values, whole in zip(found, one.said.values(), strict=True):
-                whole[rows, columns, heading] = values[cells].reshape(rows.stop - rows.start, -1)
+            seen = net.height_scale, net.saturation
+            if seen not in reliefs:
+                reliefs[seen] = net.relief(part)
+            f = net.feasibility(part, command.expand(len(part), -1))
+            found[name][:, first : first + CACHED] = torch.stack((f, *net.losses(reliefs[seen])))
+    return found
 
 
 def ood_score(taus: Taus, specialist: Specialist) -> OodScore:

@@ -13,7 +13,7 @@ eight times more taps (at cells of 0.1 and 0.05 m) than the patch has points. Eq
 tile are assessed once.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
 from typing import Literal
 
@@ -55,33 +55,35 @@ def cells_seeing(
 
 def _sampled(
     heights: Float[np.ndarray, "nx ny"],
-    yaw: float,
+    yaws: Sequence[float],
     grid: patches.PatchGrid,
     resolution: float,
     tiles: Iterable[Tile],
-) -> Iterator[tuple[Tile, Float[Tensor, "cells points"]]]:
-    """Reference: cut the patch of every cell by itself."""
+) -> Iterator[tuple[Tile, Float[Tensor, "d cells points"]]]:
+    """Reference: cut the patch of every cell and heading by itself."""
     # Positions in float64: in float32, metres ten from the origin round off 1e-5 of a cell.
     surface = torch.tensor(heights, dtype=torch.float64)
     x, y = ((torch.arange(n, dtype=torch.float64) + 0.5) * resolution for n in heights.shape)
     for rows, columns in tiles:
-        heading = torch.tensor([yaw], dtype=torch.float64)
-        poses = torch.cartesian_prod(x[rows], y[columns], heading)
-        patch = patches.sample_patches(surface, poses, grid, resolution=resolution)
-        yield (rows, columns), patch.float()
+        poses = torch.cartesian_prod(torch.tensor(yaws, dtype=torch.float64), x[rows], y[columns])
+        patch = patches.sample_patches(surface, poses.roll(-1, 1), grid, resolution=resolution)
+        yield (rows, columns), patch.float().unflatten(0, (len(yaws), -1))
 
 
 def _shifted(
     heights: Float[np.ndarray, "nx ny"],
-    yaw: float,
+    yaws: Sequence[float],
     grid: patches.PatchGrid,
     resolution: float,
     tiles: Iterable[Tile],
-) -> Iterator[tuple[Tile, Float[Tensor, "cells points"]]]:
+) -> Iterator[tuple[Tile, Float[Tensor, "d cells points"]]]:
     """Fast: one point of the patch, for all cells, is the map shifted by that point's offset."""
-    whole, part, margin = _offsets(grid, yaw, resolution)
-    a, b = part.float().T[..., None, None]
-    i, j = (whole + margin).T
+    offsets = [_offsets(grid, yaw, resolution) for yaw in yaws]
+    margin = max(reach for *_, reach in offsets)
+    # A patch that reaches as far back as ahead has, turned round, the same points in reverse.
+    reversible = grid.ahead == grid.behind
+    if reversible:
+        offsets = offsets[: len(yaws) // 2]
     surface = torch.from_numpy(np.pad(heights, margin, mode="edge"))
     for rows, columns in tiles:
         nx, ny = (at.stop - at.start for at in (rows, columns))
@@ -90,11 +92,29 @@ def _shifted(
         seen = seen - seen.mean()
         # A view, not a copy: shifted[i, j] is the tile moved by (i - margin, j - margin) cells.
         shifted = seen.unfold(0, nx, 1).unfold(1, ny, 1)
-        # The bilinear rule of `sample_heights`: a shift by part of a cell blends its neighbours.
-        near = torch.lerp(shifted[i, j], shifted[i, j + 1], b)
+        patch = torch.stack([_blended(shifted, margin, *one[:2]) for one in offsets])
+        patch -= patches.ground_height(patch, grid)
+        yield (rows, columns), torch.cat((patch, patch.flip(-1))) if reversible else patch
+
+
+def _blended(
+    shifted: Float[Tensor, "i j nx ny"],
+    margin: int,
+    whole: Int[Tensor, "points 2"],
+    part: Float[Tensor, "points 2"],
+) -> Float[Tensor, "cells points"]:
+    """Return every point of the patch for all cells of a tile, by the rule of `sample_heights`.
+
+    A shift by part of a cell blends its neighbours.
+    """
+    i, j = (whole + margin).T
+    patch = shifted[i, j]
+    if part.any():
+        a, b = part.float().T[..., None, None]
+        near = torch.lerp(patch, shifted[i, j + 1], b)
         far = torch.lerp(shifted[i + 1, j], shifted[i + 1, j + 1], b)
-        patch = torch.lerp(near, far, a).flatten(1).T
-        yield (rows, columns), patch - patches.ground_height(patch, grid)
+        patch = torch.lerp(near, far, a)
+    return patch.flatten(1).T
 
 
 def _offsets(
@@ -102,21 +122,30 @@ def _offsets(
 ) -> tuple[Int[Tensor, "points 2"], Float[Tensor, "points 2"], int]:
     """Return where points lie from their cell, in whole cells and parts, and how far they see."""
     offsets = patches.rotate(grid.points.double(), torch.tensor(yaw)) / resolution
+    # The cosine of a right angle is 6e-17: such a point lies on a cell's centre, not beside it.
+    offsets = torch.where((offsets - offsets.round()).abs() < 1e-9, offsets.round(), offsets)
     whole = offsets.floor().long()
     return whole, offsets - whole, int(whole.abs().max()) + 1
 
 
 def distinct_patches(
-    patch: Float[Tensor, "cells points"],
-) -> tuple[Float[Tensor, "distinct points"], Int[Tensor, " cells"]]:
-    """Return each distinct patch once, and which of them every cell has.
+    patch: Float[Tensor, "n points"],
+) -> tuple[Float[Tensor, "distinct points"], Int[Tensor, " n"]]:
+    """Return each distinct patch once, and which of them every given one is.
 
-    Ground that was built repeats itself: beside a step, cells in a row look alike.
+    Ground that was built repeats itself: beside a step, cells in a row look alike, and flat ground
+    looks alike along every heading.
     """
-    rows = np.ascontiguousarray(patch.numpy())
-    whole = rows.view(f"V{rows.strides[0]}").ravel()  # a row is compared as one run of bytes
-    _, first, cells = np.unique(whole, return_index=True, return_inverse=True)
-    return torch.from_numpy(rows[first]), torch.from_numpy(cells)
+    rows = patch.numpy()
+    bits = rows.view(np.uint32)
+    # Patches are told apart by a number each; equal numbers are then compared point by point.
+    factors = np.random.default_rng(0).integers(2**64, size=bits.shape[1], dtype=np.uint64)
+    _, first, which = np.unique(bits @ factors, return_index=True, return_inverse=True)
+    if len(first) == len(rows):
+        return patch, torch.arange(len(rows))
+    if not np.array_equal(bits[first][which], bits):
+        _, first, which = np.unique(bits, axis=0, return_index=True, return_inverse=True)
+    return patch[first], torch.from_numpy(which)
 
 
 WAYS = {"auto": _shifted, "reference": _sampled, "fast": _shifted}

@@ -1,11 +1,20 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.evaluation.calibration import CalibrationConfig, drive, run, run_task, table
+from fgtutor.evaluation.calibration import (
+    CalibrationConfig,
+    drive,
+    run,
+    run_task,
+    strange_grounds,
+    table,
+)
 from fgtutor.specialist import load_zoo, save_specialist
 
 
@@ -41,7 +50,7 @@ def test_a_net_that_promises_too_much_is_found_out(results):
     # A rolling toy drops into gaps and then tracks nothing, whatever its net predicts.
     assert results["gaps"]["calibration_error"] > results["flat"]["calibration_error"] + 0.1
     for name, row in results.items():
-        assert row["specialist"] == name and set(row["w_ood"]) == {"flat", "gaps"}
+        assert row["ground"] == name and set(row["w_ood"]) == {"flat", "gaps"}
         assert sum(count for *_, count in row["calibration"]) == row["samples"]
 
 
@@ -57,24 +66,40 @@ def test_the_command_prints_a_table_and_writes_the_report(config, capsys, tmp_pa
     assert run(replace(config, out=out)) == 0
     rows = json.loads((out / "rows.json").read_text())
     printed = capsys.readouterr().out
-    assert "2 of 2 tasks to do\n" in printed
+    assert "4 of 4 tasks to do\n" in printed
     assert table(rows) in printed and "tau paper" in printed
     text = (out / "table.md").read_text()
-    assert table(rows) in text and "2 drives in all" in text
+    assert table(rows) in text and "4 grounds in all" in text
 
 
 def test_the_table_by_hand():
-    def row(name, error, flat, gaps):
-        w_ood = {"flat": flat, "gaps": gaps}
-        return {"specialist": name, "calibration_error": error, "w_ood": w_ood}
+    def row(ground, error, flat, gaps):
+        w_ood, auroc = ({"flat": a, "gaps": b} for a, b in zip(flat, gaps, strict=True))
+        return {"ground": ground, "calibration_error": error, "w_ood": w_ood, "auroc": auroc}
 
-    # A column says whose patches they are, a line who is asked about them.
-    assert table([row("flat", 0.1, 0.9, None), row("gaps", 0.25, 0.3, 0.8)]).splitlines() == [
-        "| specialist | calibration error | w_ood own | w_ood flat | w_ood gaps |",
-        "| --- | --- | --- | --- | --- |",
-        "| flat | 0.100 | 0.90 | - | 0.30 |",
-        "| gaps | 0.250 | 0.80 | - | - |",
+    rows = [
+        row("flat", 0.1, (0.9, None), (None, None)),
+        row("gaps", 0.25, (0.3, 0.95), (0.8, None)),
+        row("quarry", None, (0.1, 0.99), (0.2, 0.9)),
     ]
+    # A column says whose patches they are, a line who is asked about them.
+    assert table(rows).splitlines() == [
+        "| specialist | calibration error | w_ood own | flat | gaps | quarry |",
+        "| --- | --- | --- | --- | --- | --- |",
+        "| flat | 0.100 | 0.90 | - | 0.30 / 0.95 | 0.10 / 0.99 |",
+        "| gaps | 0.250 | 0.80 | - / - | - | 0.20 / 0.90 |",
+    ]
+
+
+def test_strange_ground_is_stranger_than_home(config, tmp_path):
+    rng = np.random.default_rng(0)
+    ElevationMap(rng.normal(0, 2.0, (40, 40)), 0.05).save(tmp_path / "cliffs.npz")
+    config = replace(config, maps=(tmp_path / "cliffs.npz",))
+    names = strange_grounds(config)
+    assert names == ["rubble", "natural", str(tmp_path / "cliffs.npz")]
+    (row,) = run_task(config, names[-1])
+    assert row["ground"] == "cliffs" and row["calibration_error"] is None
+    assert row["w_ood"]["gaps"] < 0.05 and row["auroc"]["gaps"] > 0.9
 
 
 @pytest.mark.slow

@@ -8,13 +8,12 @@ import torch
 
 from fgtutor.errors import ThresholdError
 from fgtutor.feasibility import FeasibilityNet, OodScore, ood_weight
-from fgtutor.learning import training
+from fgtutor.learning import refit, training
 from fgtutor.learning.calibrate import (
     CalibrateConfig,
     calibrated,
-    fit_autoencoder,
+    met_in_training,
     quantiles_on,
-    with_new_autoencoder,
 )
 from fgtutor.learning.training import TrainConfig, train
 from fgtutor.specialist import load_specialist, save_specialist
@@ -58,7 +57,7 @@ def test_at_most_alpha_of_the_own_patches_lose_weight():
 def test_the_strangeness_is_a_share_of_the_relief():
     net = FeasibilityNet(12, hidden=(4, 4), vae_hidden=(4, 4), latent=2, height_scale=2.0)
     patch = torch.randn(5, 12)
-    loss, strangeness = net.losses(patch)
+    loss, strangeness = net.losses(net.relief(patch))
     torch.testing.assert_close(loss, net.reconstruction(patch))
     torch.testing.assert_close(strangeness, loss / (1 + (2 * patch).square().sum(-1)))
     flat = FeasibilityNet(12, hidden=(4, 4), vae_hidden=(4, 4), latent=2, saturation=0.1)
@@ -66,7 +65,7 @@ def test_the_strangeness_is_a_share_of_the_relief():
     # Saturated heights: a chasm of 10 m looks like one of 1 m, a step of 1 cm like itself.
     deep = torch.zeros(2, 12)
     deep[0, :6], deep[1, :6] = -1.0, -10.0
-    torch.testing.assert_close(*flat.losses(deep)[0], rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(*flat.losses(flat.relief(deep))[0], rtol=1e-3, atol=1e-3)
     low = 0.01 * patch / patch.abs().max()
     torch.testing.assert_close(flat.relief(low), 4 * low, rtol=4e-3, atol=0)
 
@@ -114,9 +113,8 @@ def test_calibrating_changes_neither_policy_nor_f(make_rolling, config, tmp_path
 
 def test_a_new_autoencoder_knows_its_terrain_better(make_rolling, config):
     rolling = make_rolling("steps")
-    net = with_new_autoencoder(
-        rolling, replace(config, updates=150, vae_hidden=(16, 8), latent=3, saturation=0.2)
-    )
+    config = replace(config, updates=150, vae_hidden=(16, 8), latent=3, saturation=0.2)
+    net = refit.refitted(rolling, met_in_training(rolling, config), config)
     assert net.saturation == 0.2 and net.vae_hidden == (16, 8)
     patch, command = 0.1 * torch.randn(30, net.num_points), torch.randn(30, 3)
     torch.testing.assert_close(
@@ -125,6 +123,20 @@ def test_a_new_autoencoder_knows_its_terrain_better(make_rolling, config):
     fresh = FeasibilityNet(net.num_points, vae_hidden=(16, 8), latent=3, saturation=0.2)
     flat = torch.zeros(1, net.num_points)
     assert net.reconstruction(flat) < fresh.reconstruction(flat)
+
+
+def test_a_smaller_head_says_the_same_anywhere(make_rolling, config, monkeypatch):
+    monkeypatch.setattr(refit, "GROUNDS", 6)
+    monkeypatch.setattr(refit, "POSES", 300)
+    rolling = make_rolling("steps")
+    config = replace(config, updates=600, hidden=(24, 12), vae_hidden=(8, 4), latent=2)
+    net = refit.refitted(rolling, met_in_training(rolling, config), config)
+    assert net.hidden == (24, 12)
+    patch = refit.any_ground(rolling, seed=1)
+    command = torch.tensor(rolling.command).expand(len(patch), -1)
+    old = rolling.feasibility.feasibility(patch, command)
+    error = net.feasibility(patch, command) - old
+    assert error.square().mean() < 0.1 * old.var() + 1e-4
 
 
 def test_a_finished_training_is_safe_before_it_is_calibrated(tmp_path, monkeypatch):
@@ -145,7 +157,7 @@ def test_fitting_leaves_the_head_alone():
     head = [value.clone() for value in net.head.state_dict().values()]
     patch = 0.1 * torch.randn(200, 12)
     before = net.reconstruction(patch).mean()
-    fit_autoencoder(net, patch, 100, batch=32)
+    refit.fit_autoencoder(net, patch, 100)
     assert net.reconstruction(patch).mean() < before
     assert all(map(torch.equal, head, net.head.state_dict().values()))
     losses, strangeness = quantiles_on(net, patch)

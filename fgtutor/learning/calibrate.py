@@ -1,12 +1,11 @@
 """What a Feasibility-Net says of its own terrain, measured with the finished policy on new ground.
 
 Reads a specialist; gives quantiles of L_recon and of the strangeness on held-out terrain, driven
-with deterministic actions, and, if asked for, an autoencoder fitted anew to what the finished
-policy meets where it was trained. The policy and f are never changed.
+with deterministic actions, and, if asked for, a Feasibility-Net fitted anew (`refit`) to what the
+finished policy meets where it was trained. The policy is never changed.
 Source: paper, Sec. III-A (Eqs. 1-3); the calibration is ours (`feasibility.OodScore`).
 """
 
-import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,8 +26,8 @@ from fgtutor.feasibility import (
     Saturation,
     feasibility_labels,
 )
-from fgtutor.io.progress import watch
 from fgtutor.io.validation import Count, CountOrZero, Seed, Width, check_fields
+from fgtutor.learning.refit import EASIEST, refitted
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.specialist import GENERAL, Specialist, load_specialist, save_specialist
 from fgtutor.world.terrain import Terrain, World, make_terrain
@@ -36,9 +35,6 @@ from fgtutor.world.terrain import Terrain, World, make_terrain
 HELD_OUT = 2**40
 """Where the seeds of calibration terrain begin: odd, so never trained on, and beyond the seeds of
 every evaluation."""
-EASIEST = 0.85
-"""Difficulty of the easiest terrain that a Feasibility-Net is fitted to: easy ground is not what a
-specialist is for, and ground that all of them know."""
 RELIEF = 0.06
 """A patch with at least this difference of heights is distinctive of its terrain, m: flat ground is
 familiar to every policy, and says nothing about which one."""
@@ -55,7 +51,9 @@ class CalibrateConfig:
     updates: CountOrZero = 0
     """Updates of a new autoencoder, fitted to what the policy meets on training terrain; with 0 it
     stays as it is."""
-    vae_hidden: tuple[Width, Width] = (128, 64)
+    hidden: tuple[Width, Width] | None = None
+    """Widths of a smaller head, fitted to the old one's f in as many updates; None: it stays."""
+    vae_hidden: tuple[Width, Width] = (64, 32)
     """Widths of the new encoder; the decoder mirrors them."""
     latent: Width = 24
     """Width of the new latent."""
@@ -164,7 +162,7 @@ def quantiles_on(
     net: FeasibilityNet, patch: Float[Tensor, "n points"]
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the quantiles `LEVELS` of L_recon and of the strangeness over patches."""
-    each = zip(*(net.losses(part) for part in patch.split(8192)), strict=True)
+    each = zip(*(net.losses(net.relief(part)) for part in patch.split(8192)), strict=True)
     loss, strangeness = map(torch.cat, each)
 
     def quantiles(values: Float[Tensor, " n"]) -> dict[str, float]:
@@ -174,77 +172,29 @@ def quantiles_on(
     return quantiles(loss), quantiles(strangeness)
 
 
-def fit_autoencoder(
-    net: FeasibilityNet,
-    patch: Float[Tensor, "n points"],
-    updates: int,
-    *,
-    batch: int = 512,
-    learning_rate: float = 3e-3,
-    seed: int = 0,
-    progress: bool = False,
-) -> None:
-    """Fit the autoencoder of a Feasibility-Net to patches (Eq. 3); its head stays as it is.
-
-    The learning rate rises over the first 200 updates, and falls as a cosine.
-    """
-    rng = torch.Generator().manual_seed(seed)
-    optimizer = torch.optim.Adam([*net.encoder.parameters(), *net.decoder.parameters()], fused=True)
-    net.train().requires_grad_(True)
-    for update in watch(range(updates), updates, "fitting", show=progress, unit="update"):
-        rate = min(1.0, (update + 1) / 200) * (1 + math.cos(math.pi * update / updates)) / 2
-        for group in optimizer.param_groups:
-            group["lr"] = learning_rate * (rate + 1e-3)
-        chosen = torch.randint(len(patch), (batch,), generator=rng)
-        loss, _ = net.autoencoder_loss(patch[chosen], generator=rng)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    net.eval().requires_grad_(False)
-
-
-def with_new_autoencoder(specialist: Specialist, config: CalibrateConfig) -> FeasibilityNet:
-    """Return a Feasibility-Net that finds the same feasible, with an autoencoder fitted anew."""
-    old = specialist.feasibility
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        net = FeasibilityNet(
-            old.num_points,
-            command_dim=old.command_dim,
-            hidden=(old.hidden[0], old.hidden[1]),
-            vae_hidden=config.vae_hidden,
-            latent=config.latent,
-            height_scale=config.height_scale,
-            saturation=config.saturation,
-        )
-    net.head.load_state_dict(old.head.state_dict())
-    with torch.no_grad():  # the head reads heights in the new units
-        first = net.head.get_parameter("0.weight")
-        first[:, : old.num_points] *= old.height_scale / config.height_scale
+def met_in_training(specialist: Specialist, config: CalibrateConfig) -> Rollout:
+    """Return what the finished policy meets, with its action noise, on worlds like its own."""
     met = []
     for world in range(config.worlds):
-        first_seed = 2 * (2**39 + 1000 * (config.seed * config.worlds + world))
-        tiles = own_terrain(specialist, config.envs, first_seed, easiest=EASIEST)
+        first = 2 * (2**39 + 1000 * (config.seed * config.worlds + world))
+        tiles = own_terrain(specialist, config.envs, first, easiest=EASIEST)
         met.append(
-            roll_out(
-                specialist, tiles, config.envs, config.seconds, seed=world + 1, noise=True
-            ).patch
+            roll_out(specialist, tiles, config.envs, config.seconds, seed=world + 1, noise=True)
         )
-    patch = torch.cat(met)
-    if env_class(specialist.robot).mirror:  # its mirror image would have met theirs
-        mirrored = patch.reshape(-1, *specialist.grid.shape).flip(-1).flatten(1)
-        patch = torch.cat((patch, mirrored))
-    fit_autoencoder(net, patch, config.updates, seed=config.seed, progress=True)
-    return net
+    fields = ("patch", "command", "label")
+    return Rollout(*(torch.cat([getattr(one, name) for one in met]) for name in fields))
 
 
 def calibrated(specialist: Specialist, config: CalibrateConfig) -> Specialist:
     """Return the specialist with quantiles measured on held-out terrain of full difficulty.
 
-    With `config.updates`, its Feasibility-Net has a new autoencoder.
+    With `config.updates`, its Feasibility-Net is fitted anew before.
     """
     if config.updates:
-        specialist = replace(specialist, feasibility=with_new_autoencoder(specialist, config))
+        specialist = replace(
+            specialist,
+            feasibility=refitted(specialist, met_in_training(specialist, config), config),
+        )
     tiles = own_terrain(specialist, config.envs, 2 * (config.seed * 10_000 + HELD_OUT) + 1)
     held_out = roll_out(specialist, tiles, config.envs, config.seconds, seed=config.seed)
     quantiles, strangeness = quantiles_on(specialist.feasibility, held_out.distinctive)
