@@ -3,7 +3,8 @@
 Reads folders that a `fgtutor evaluate` command has finished; replaces what stands between
 `<!-- table NAME -->` and `<!-- end NAME -->` in the page that has these lines. Folders of other
 policies or planners, all else being equal, join the first one's table: a specialist that has
-changed need not wait for the others again.
+changed need not wait for the others again. Folders of other settings (the paper's beside ours) have
+a table of their own below, under their own caption.
 Use: python benchmarks/readme_table.py NAME FOLDER [FOLDER ...]
 """
 
@@ -40,29 +41,35 @@ def fill(pages: Sequence[Path], name: str, block: str) -> None:
 
 
 def block_of(folders: Sequence[Path]) -> str:
-    """Return the table of report folders and its caption, with all trials counted and the date."""
-    tables, captions, runs, trials = [], [], [], 0
+    """Return the tables of report folders, with all trials counted and the date."""
+    tables: dict[str, list[list[list[str]]]] = {}  # by caption, which names the settings
+    runs: dict[str, list[dict[str, Any]]] = {}
+    trials = 0
     for folder in folders:
         try:
             _, table, caption = (folder / TABLE).read_text().strip().split("\n\n")
             trials += len(json.loads((folder / ROWS).read_bytes()))
-            runs.append(json.loads((folder / RUN).read_bytes()))
+            run = json.loads((folder / RUN).read_bytes())
         except (OSError, ValueError) as error:
             raise ReportError(
                 f"{folder} holds no finished report ({error}): run the command with --out to its "
                 "end"
             ) from error
         head, _, *lines = (line.strip("| ").split(" | ") for line in table.splitlines())
-        tables.append([head, *lines])
-        captions.append(re.sub(r" [\d,]+ trials in all\.$", "", caption))
-    if len(set(captions)) > 1:  # which say how many trials a cell has, and how they were driven
-        raise ReportError("the folders are not of one table: " + " / ".join(captions))
-    settings = [run["settings"] for run in runs]
-    _check(settings)
-    head, *lines = reduce(join, tables)
-    date, command = max(run["finished"] for run in runs)[:10], settings[0]["command"]
-    count = f"*{trials:,} trials of `fgtutor {command}`, {date}.*"
-    return "\n\n".join([markdown(head, lines), captions[0], count])
+        caption = re.sub(r" [\d,]+ trials in all\.$", "", caption)
+        tables.setdefault(caption, []).append([head, *lines])
+        runs.setdefault(caption, []).append(run)
+    parts = []
+    for caption, joined in tables.items():
+        _check([run["settings"] for run in runs[caption]])
+        head, *lines = reduce(join, joined)
+        parts += [markdown(head, lines), caption]
+    every = [run for some in runs.values() for run in some]
+    commands = {run["settings"]["command"] for run in every}
+    if len(commands) > 1:
+        raise ReportError(f"the folders are of several commands: {', '.join(sorted(commands))}")
+    date = max(run["finished"] for run in every)[:10]
+    return "\n\n".join([*parts, f"*{trials:,} trials of `fgtutor {commands.pop()}`, {date}.*"])
 
 
 def join(one: list[list[str]], other: list[list[str]]) -> list[list[str]]:

@@ -313,27 +313,6 @@ def _share_beyond(
     return torch.exp(p[i - 1] + slope * (at - x[i - 1])).clip(0, 1)
 
 
-def calibrated_taus(quantiles: Mapping[str, float]) -> tuple[float, float]:
-    """Return (tau_low, tau_high): the 90 % quantile of L_recon on the own terrain, twice the 99 %.
-
-    So nine tenths of the own terrain keep full weight. Why not stop at the 99 % quantile? A route
-    has a hundred places and needs every one of them: with one odd place in a hundred closed, a
-    fifth of all crossings of the own terrain found no route at all. Twice as badly reconstructed
-    counts as never seen. Raises `ThresholdError` if "0.9" or "0.99" is missing or the two are not
-    positive and increasing.
-    """
-    try:
-        low, high = float(quantiles["0.9"]), float(quantiles["0.99"])
-    except (KeyError, TypeError, ValueError, OverflowError):
-        low = high = math.nan
-    if not (0 < low < high and 2 * high < math.inf):
-        raise ThresholdError(
-            'calibrated taus need positive, increasing quantiles "0.9" and "0.99" of L_recon, got '
-            f'{dict(quantiles)}: train the specialist again, or use taus="paper"'
-        )
-    return low, 2 * high
-
-
 def _mlp(activation: type[nn.Module], *widths: int) -> nn.Sequential:
     """Build linear layers between the given widths, with an activation after all but the last."""
     layers: list[nn.Module] = []

@@ -47,7 +47,7 @@ from fgtutor.grid import coordinate_text, point_text
 from fgtutor.io.progress import QUICK, duration
 from fgtutor.io.validation import numbers
 from fgtutor.routes import Refusal, Route
-from fgtutor.settings import PAPER, SETTINGS, PlanSettings, Unknown
+from fgtutor.settings import HEADINGS, PAPER, SETTINGS, PlanSettings, Unknown
 from fgtutor.specialist import Specialist
 from fgtutor.tensorization import assess_all
 
@@ -203,7 +203,7 @@ def plan(
         ood: w_ood [nx, ny, d] of every policy, for explanations only.
         names: Names of the policies; default: "policy 0" and so on.
         changes: Single fields of `PlanSettings` to change, such as `f_min=0.3`. The headings are
-            those of the tensors.
+            those of the tensors; to ask for others is an error.
 
     Raises:
         OffMapError: Start or goal is off the map.
@@ -213,8 +213,17 @@ def plan(
     """
     if settings is None and tensors is None:
         changes = {"switch_cost": 0.0} | changes
+    chosen = replace(settings or PlanSettings(), **changes)
+    said = "headings" in changes or chosen.headings != HEADINGS
     problem = _Problem(
-        replace(settings or PlanSettings(), **changes), fused, policy_map, grid, tensors, ood, names
+        chosen,
+        fused,
+        policy_map,
+        grid,
+        tensors,
+        ood,
+        names,
+        chosen.headings if said else None,
     )
     try:
         return problem.cheapest(start, goal)
@@ -234,6 +243,7 @@ class _Problem:
         tensors: Sequence[ArrayLike] | None,
         ood: Sequence[ArrayLike] | None,
         names: Sequence[str] | None,
+        headings: int | None,
     ) -> None:
         self.settings, self.grid = settings, grid
         if settings.switch_cost > 0 and tensors is None:
@@ -243,6 +253,11 @@ class _Problem:
         kept = given.get("tensors", 0) + given.get("ood", 0)
         fused = numbers("fused", fused, PlanningError)
         self.headings = Headings.of(fused)
+        if headings not in (None, self.headings.count):
+            raise ConfigError(
+                f"fused holds {self.headings.count} headings, not {headings}: give "
+                f"headings={headings} to tensorize, or leave it out here"
+            )
         check_memory(grid.shape, kept, settings.switch_cost, self.headings)
         self.fused = self._fit("fused", [fused])[0]
         policies = self._fit("policy_map", [policy_map])[0]
@@ -301,11 +316,13 @@ class _Problem:
         states = self.search.networkx(*ends) if networked else self.search.scipy(*ends)
         if states is None:
             nearest, heading = self._nearest(self.search.reached(ends[0]), ends[1])
+            few = self.headings.count < 32
+            more = "use headings=32, which see ways between these, " if few else ""
             error = UnreachableError(
                 f"start {self._text(start)} m, cell {ends[0]}, and goal {self._text(goal)} m, cell "
                 f"{ends[1]}, can both be used, but no chain of steps with F >= "
                 f"{self.settings.f_min:g} joins them: the place nearest to the goal that can be "
-                f"reached is {self._text(nearest)} m; lower f_min, move one of them or add a "
+                f"reached is {self._text(nearest)} m; {more}lower f_min, move one of them or add a "
                 "specialist (tensorization.why_blocked names what closes a cell)"
             )
             return Refusal(error, nearest, heading)

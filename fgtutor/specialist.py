@@ -75,12 +75,11 @@ class Specialist:
     ahead, since patches look along the heading."""
     label_seconds: Annotated[float, Interval(ge=0, le=3600)]
     """Seconds over which r_v was averaged into the label; 0 is the paper's instantaneous r_v."""
-    quantiles: Mapping[str, float]
-    """Quantiles of L_recon on its own terrain, in the Feasibility-Net's scaled units, by
-    probability ("0.95": ...)."""
+    quantiles: Mapping[str, float] = field(default_factory=dict)
+    """Quantiles of L_recon on its own held-out terrain, in the Feasibility-Net's scaled units, by
+    probability ("0.95": ...); none if it was never calibrated (`fgtutor calibrate`)."""
     strangeness: Mapping[str, float] = field(default_factory=dict)
-    """Quantiles of the strangeness (`FeasibilityNet.losses`) on its own held-out terrain; none if
-    it was never calibrated (`fgtutor calibrate`)."""
+    """Quantiles of the strangeness (`FeasibilityNet.losses`) there."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """Where it came from: terrain, samples, seed, package versions; kept as JSON keeps it."""
 

@@ -25,7 +25,7 @@ from fgtutor import patches
 from fgtutor.directions import HeadingCount, Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, ThresholdError
-from fgtutor.feasibility import TAU_HIGH, TAU_LOW, OodScore, calibrated_taus, ood_weight
+from fgtutor.feasibility import TAU_HIGH, TAU_LOW, OodScore, ood_weight
 from fgtutor.grid import point_text
 from fgtutor.io.machine import require_memory
 from fgtutor.io.progress import watch
@@ -308,14 +308,17 @@ def _ask(
 def ood_score(taus: Taus, specialist: Specialist) -> OodScore:
     """Return what w_ood follows from: the specialist's calibration, or thresholds on L_recon.
 
-    A specialist that was never calibrated has thresholds from the quantiles of its training. Raises
-    `ThresholdError` for another name, and unless 0 <= tau_low < tau_high, both finite.
+    Raises `ThresholdError` for a specialist that was never calibrated, for another name, and unless
+    0 <= tau_low < tau_high, both finite.
     """
     if taus == "paper":
         return OodScore()
     if taus == "calibrated":
         if not specialist.strangeness:
-            return OodScore(calibrated_taus(specialist.quantiles))
+            raise ThresholdError(
+                f"{specialist.name} was never calibrated: run `fgtutor calibrate` on its folder, "
+                'or use taus="paper"'
+            )
         return OodScore(None, (specialist.quantiles, specialist.strangeness))
     try:
         low, high = (float(tau) for tau in taus)

@@ -96,7 +96,10 @@ def test_strange_ground_is_stranger_than_home(config, tmp_path):
     ElevationMap(rng.normal(0, 2.0, (40, 40)), 0.05).save(tmp_path / "cliffs.npz")
     config = replace(config, maps=(tmp_path / "cliffs.npz",))
     names = strange_grounds(config)
-    assert names == ["rubble", "natural", str(tmp_path / "cliffs.npz")]
+    assert names == ["rubble", "natural", "cliffs"]
+    twice = replace(config, maps=(*config.maps, tmp_path / "elsewhere" / "cliffs.npz"))
+    with pytest.raises(ConfigError, match=r"cliffs, cliffs: rename a map"):
+        strange_grounds(twice)
     (row,) = run_task(config, names[-1])
     assert row["ground"] == "cliffs" and row["calibration_error"] is None
     assert row["w_ood"]["gaps"] < 0.05 and row["auroc"]["gaps"] > 0.9

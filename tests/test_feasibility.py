@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fgtutor.errors import ThresholdError
-from fgtutor.feasibility import FeasibilityNet, calibrated_taus, ood_weight
+from fgtutor.feasibility import FeasibilityNet, ood_weight
 
 POINTS = 6
 
@@ -59,19 +59,6 @@ def test_ood_weight_never_grows_with_the_loss(one, other, low, width):
     better, worse = sorted((one, other))
     weights = ood_weight(better, low, low + width), ood_weight(worse, low, low + width)
     assert 1 >= weights[0] >= weights[1] >= 0
-
-
-def test_calibrated_taus_come_from_the_own_terrain():
-    assert calibrated_taus({"0.9": 0.2, "0.95": 0.3, "0.99": 0.4}) == (0.2, 0.8)
-
-
-@pytest.mark.parametrize(
-    "quantiles",
-    [{}, {"0.9": 0.2}, {"0.9": 0.4, "0.99": 0.2}, {"0.9": 0.0, "0.99": 1.0}, {"0.9": "x"}],
-)
-def test_calibrated_taus_say_what_is_missing(quantiles):
-    with pytest.raises(ThresholdError, match="train the specialist again"):
-        calibrated_taus(quantiles)
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])

@@ -335,3 +335,31 @@ def test_a_route_of_long_steps_is_driven(count):
     straight = np.subtract(goal, start) / np.hypot(*np.subtract(goal, start))
     aside = (episode.poses[:, :2] - start) @ (-straight[1], straight[0])
     assert np.abs(aside).max() < 0.25
+
+
+def test_other_headings_than_the_tensors_have_are_an_error(flat_tensor):
+    fused, elevation = flat_tensor
+    ends = {"start": (0.15, 0.15), "goal": (0.75, 0.75)}
+    policy_map = torch.zeros(fused.shape, dtype=torch.long)
+    for asked in ({"headings": 16}, {"settings": PlanSettings(headings=32, switch_cost=0.0)}):
+        with pytest.raises(
+            ConfigError, match=r"fused holds 8 headings, not (16|32): give headings="
+        ):
+            plan(fused, policy_map, grid=elevation, **ends, **asked)
+    assert plan(fused, policy_map, grid=elevation, **ends, headings=8).raise_for().num_headings == 8
+
+
+def test_a_refusal_of_few_headings_names_the_more(flat_tensor):
+    fused, elevation = flat_tensor
+    fused[4] = 0.0  # a wall across the map
+    policy_map = torch.zeros(fused.shape, dtype=torch.long)
+    refused = plan(fused, policy_map, grid=elevation, start=(0.15, 0.15), goal=(0.85, 0.15))
+    with pytest.raises(UnreachableError, match="use headings=32"):
+        refused.raise_for()
+
+
+@pytest.fixture
+def flat_tensor():
+    elevation = ElevationMap(np.zeros((10, 9)), 0.1)
+    within = Headings(8).steps_within(elevation.known)
+    return 0.5 * torch.from_numpy(within).float(), elevation

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 
 import pytest
 import torch
@@ -466,3 +467,16 @@ def test_a_share_of_the_terrains_has_neighbours_where_there_can_be_any():
     assert [tile.seed for row in without for tile in row] == [tile.seed for tile in tiles]
     gentle = training_world(TrainConfig(terrain="gentle", rows=1, columns=4, neighbours=1.0))
     assert all(tile.limits is None for tile in gentle.tiles[0])
+
+
+def test_a_new_world_takes_the_place_of_the_last(tmp_path, monkeypatch):
+    trainer = Trainer(TrainConfig(terrain="flat", out=tmp_path, num_envs=4, steps=26))
+    last, make = weakref.ref(trainer.env), trainer._make_env
+
+    def made():
+        assert last() is None  # never two worlds in memory at a time
+        return make()
+
+    monkeypatch.setattr(trainer, "_make_env", made)
+    trainer._renew(trainer.env.state_dict())
+    assert trainer.runner.env is trainer.env

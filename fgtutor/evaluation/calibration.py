@@ -136,19 +136,29 @@ def promised(
 
 
 def strange_grounds(config: CalibrationConfig) -> list[str]:
-    """Return the names of grounds that no specialist of the zoo was trained on."""
-    homes = {
-        str(specialist.provenance.get("terrain", name))
-        for name, specialist in config.load_zoo().items()
-    }
-    return [*(kind for kind in STRANGE if kind not in homes), *map(str, config.maps)]
+    """Return the names of grounds that no specialist of the zoo was trained on.
+
+    Raises `ConfigError` if a map is called as another one, or as a specialist.
+    """
+    zoo = config.load_zoo()
+    homes = {str(one.provenance.get("terrain", name)) for name, one in zoo.items()}
+    names = [
+        *(kind for kind in STRANGE if kind not in homes),
+        *(path.stem for path in config.maps),
+    ]
+    if len({*names, *zoo}) < len(names) + len(zoo):
+        raise ConfigError(
+            f"each ground needs a name of its own, got {', '.join([*zoo, *names])}: rename a map"
+        )
+    return names
 
 
 def patches_of(config: CalibrationConfig, ground: str, grid: PatchGrid) -> Rollout:
     """Return patches cut anywhere on ground that nothing was trained on."""
     rng = np.random.default_rng(config.seed)
-    if ground not in STRANGE:
-        elevations = [ElevationMap.load(ground)]
+    files = {path.stem: path for path in config.maps}
+    if ground in files:
+        elevations = [ElevationMap.load(files[ground])]
     else:
         kind = "rubble" if ground == NATURAL else ground
         tiles = terrains(kind, config)
@@ -196,7 +206,7 @@ def run_task(config: CalibrationConfig, name: str) -> list[CalibrationRow]:
         samples = len(driven.label)
     return [
         {
-            "ground": Path(name).stem,
+            "ground": name,
             "samples": samples,
             "calibration_error": None if error is None else round(error, 4),
             "calibration": [[None if np.isnan(v) else round(float(v), 4) for v in b] for b in bins],

@@ -52,7 +52,7 @@ class CalibrateConfig:
     """Updates of a new autoencoder, fitted to what the policy meets on training terrain; with 0 it
     stays as it is."""
     hidden: tuple[Width, Width] | None = None
-    """Widths of a smaller head, fitted to the old one's f in as many updates; None: it stays."""
+    """Widths of a smaller head, fitted to the old f in a quarter of the updates; None: it stays."""
     vae_hidden: tuple[Width, Width] = (64, 32)
     """Widths of the new encoder; the decoder mirrors them."""
     latent: Width = 24

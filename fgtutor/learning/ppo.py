@@ -17,9 +17,6 @@ from torch import Tensor, nn
 from fgtutor.feasibility import FeasibilityNet, feasibility_labels
 from fgtutor.policies.dreamwaq import ContextNet, DreamWaQModel
 
-QUANTILES = (0.5, 0.9, 0.95, 0.99)
-"""Quantiles of L_recon that a specialist stores, for calibrated taus."""
-
 
 class FeasibilityPPO(PPO):
     """rsl_rl's PPO that also fits the Feasibility-Net to each rollout before it learns from it.
@@ -69,7 +66,7 @@ class FeasibilityPPO(PPO):
     def fit_context(self, context: ContextNet, *samples: Tensor) -> dict[str, float]:
         """Fit the context encoder to the samples of one rollout; return the mean loss parts."""
         shape = self.context_updates, self.context_batch
-        losses, _ = self._fit(context, self.context_optimizer, samples, shape)
+        losses = self._fit(context, self.context_optimizer, samples, shape)
         return {f"context_{name}": value for name, value in losses.items()}
 
     def fit_feasibility(self) -> dict[str, float]:
@@ -85,15 +82,8 @@ class FeasibilityPPO(PPO):
         )
         samples = tuple(torch.cat(parts) for parts in zip(*self.memory, strict=True))
         shape = self.feasibility_updates, self.feasibility_batch
-        losses, draws = self._fit(self.feasibility, self.feasibility_optimizer, samples, shape)
-        with torch.no_grad():
-            reconstruction = self.feasibility.reconstruction(samples[0][draws[:8].flatten()])
-        levels = torch.tensor(QUANTILES, device=reconstruction.device)
-        quantiles = torch.quantile(reconstruction, levels).tolist()
-        return {
-            **{f"feasibility_{name}": value for name, value in losses.items()},
-            **{f"L_recon_{q}": value for q, value in zip(QUANTILES, quantiles, strict=True)},
-        }
+        losses = self._fit(self.feasibility, self.feasibility_optimizer, samples, shape)
+        return {f"feasibility_{name}": value for name, value in losses.items()}
 
     def _fit(
         self,
@@ -101,10 +91,10 @@ class FeasibilityPPO(PPO):
         optimizer: torch.optim.Optimizer,
         samples: Sequence[Tensor],
         shape: tuple[int, int],
-    ) -> tuple[dict[str, float], Tensor]:
+    ) -> dict[str, float]:
         """Fit a net to samples drawn at random, `shape` = (updates, batch).
 
-        Return the mean of each part of its loss, and which samples were drawn.
+        Return the mean of each part of its loss.
         """
         sums: dict[str, float] = {}
         draws = torch.randint(len(samples[0]), shape, device=samples[0].device)
@@ -113,7 +103,7 @@ class FeasibilityPPO(PPO):
             self._descend(loss, net, optimizer)
             for name, value in parts.items():
                 sums[name] = sums.get(name, 0.0) + value.item() / len(draws)
-        return sums, draws
+        return sums
 
     def _descend(self, loss: Tensor, net: nn.Module, optimizer: torch.optim.Optimizer) -> None:
         """Take one step down the loss, along the mean gradient of all processes."""

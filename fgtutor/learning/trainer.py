@@ -9,6 +9,7 @@ Source: paper, Sec. III-A (Eqs. 1-3) and Fig. 2; PPO from rsl_rl.
 
 import contextlib
 import ctypes
+import gc
 import io
 import math
 import time
@@ -25,7 +26,7 @@ from fgtutor.learning import distributed
 from fgtutor.learning.checkpoints import CHECKPOINT, foreign, read_checkpoint, write_checkpoint
 from fgtutor.learning.config import TrainConfig, comparable, make_training_env, runner_config
 from fgtutor.learning.distributed import leads
-from fgtutor.learning.ppo import QUANTILES, FeasibilityPPO
+from fgtutor.learning.ppo import FeasibilityPPO
 from fgtutor.policies.dreamwaq import EstimatingModel
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.specialist import Specialist, load_specialist, save_specialist
@@ -262,10 +263,13 @@ class Trainer:
 
     def _renew(self, state: dict[str, torch.Tensor]) -> None:
         """Move to the world that belongs to this iteration, with the curriculum of `state`."""
+        # The last world goes first: two of rubble would take 6 GB, and it holds itself in a cycle.
+        del self.env, self.runner.env
+        gc.collect()
+        give_back_memory()
         self.env = self.runner.env = self._make_env()
         self.env.load_state_dict(state)
         self.env.reset_all()
-        give_back_memory()
 
     def resume(self) -> None:
         """Continue from the run folder's checkpoint, to more iterations if `config` says so.
@@ -316,7 +320,6 @@ class Trainer:
     def specialist(self) -> Specialist:
         """Return what has been learned so far as a `Specialist`."""
         config = self.config
-        recent = self.history[-10:]
         every = max(1, len(self.history) // 100)
         return Specialist(
             name=config.terrain,
@@ -326,9 +329,6 @@ class Trainer:
             grid=self.env.grid,
             command=(config.planning_speed, 0.0, 0.0),
             label_seconds=config.label_seconds,
-            quantiles={
-                str(q): sum(row[f"L_recon_{q}"] for row in recent) / len(recent) for q in QUANTILES
-            },
             provenance={
                 "terrain": config.terrain,
                 "iteration": self.iteration,

@@ -177,13 +177,12 @@ print(f"by hand {by_hand:.4f}, by the network {loss[0]:.4f}")
 # spread over all patches, on its own terrain and on the others'.
 
 # %%
-from fgtutor.feasibility import TAU_HIGH, TAU_LOW, calibrated_taus
+from fgtutor.feasibility import TAU_HIGH, TAU_LOW
 from fgtutor.figures.charts import draw_losses
 
 with torch.no_grad():
     losses = {name: net.reconstruction(patches) for name, patches in worlds.items()}
-taus = {"paper": (TAU_LOW, TAU_HIGH), "calibrated": calibrated_taus(zoo["steps"].quantiles)}
-draw_losses(losses, taus)
+draw_losses(losses, {"paper": (TAU_LOW, TAU_HIGH)})
 
 # %% [markdown]
 # Between "certainly home" and "certainly abroad" lies a ramp, the paper's **out-of-distribution
@@ -195,10 +194,19 @@ draw_losses(losses, taus)
 # $$
 #
 # *What to see in the lower half:* left of $\tau_\text{low}$ the net is trusted fully, right of
-# $\tau_\text{high}$ not at all. The paper's taus are one pair for all. The *calibrated* ones come
-# from the specialist's own training: nine tenths of its terrain keep full weight, and what is
-# rebuilt twice as badly as all but a hundredth of it counts as never seen. (Why twice? A route has
-# a hundred places and needs them all.)
+# $\tau_\text{high}$ not at all. The paper's taus are one pair for all networks, and what an error
+# of 2.0 means differs from one to the next.
+#
+# The *calibrated* weight needs no thresholds. After its training, every specialist was driven over
+# new ground of its own kind. Now a patch has a **p-value**: the share of those own patches that are
+# at least as strange as it is. The weight is
+#
+# $$ w_\text{ood} = \operatorname{clip}\left(\frac{p}{\alpha},\ 0,\ 1\right), \qquad \alpha = 0.03 $$
+#
+# so of its own terrain at most 3 % loses weight, for every network. Strange means either a large
+# $\mathcal L_\text{recon}$ or a large share of the patch's relief that was not understood,
+# $\mathcal L_\text{recon} / (1 + \sum h^2)$: low rubble, badly rebuilt, has a small error and a
+# large share.
 
 # %%
 from fgtutor.feasibility import ood_weight
@@ -212,15 +220,17 @@ for value in (0.05, 0.5, 1.0, 3.0):
 # Now ask all four about all four. Each row is one specialist's mean $w_\text{ood}$ on the ground
 # of each column.
 
-
 # %%
+from fgtutor.tensorization import ood_score
+
+
 def trust(choice):
     rows = []
     for specialist in zoo.values():
-        taus = (TAU_LOW, TAU_HIGH) if choice == "paper" else calibrated_taus(specialist.quantiles)
+        net, score = specialist.feasibility, ood_score(choice, specialist)
         with torch.no_grad():
-            losses = [specialist.feasibility.reconstruction(patch) for patch in worlds.values()]
-        rows.append([ood_weight(loss, *taus).mean().item() for loss in losses])
+            losses = [net.losses(net.relief(patch)) for patch in worlds.values()]
+        rows.append([score.weight(*loss).mean().item() for loss in losses])
     return rows
 
 
@@ -269,12 +279,10 @@ draw_elevation(M)
 
 # %%
 opinions = {name: assess(M, specialist) for name, specialist in zoo.items()}
-low, high = calibrated_taus(zoo["gaps"].quantiles)
-draw_weight(opinions["gaps"].ood(low, high), M, "gaps")
+draw_weight(opinions["gaps"].ood(), M, "gaps")
 
 # %%
-low, high = calibrated_taus(zoo["steps"].quantiles)
-draw_weight(opinions["steps"].ood(low, high), M, "steps")
+draw_weight(opinions["steps"].ood(), M, "steps")
 
 # %% [markdown]
 # *What to see:* full colour where the specialist feels at home; flat ground is home to everybody,

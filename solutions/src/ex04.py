@@ -64,22 +64,24 @@ check("ex04.q2", ood_weight)
 # %% [markdown]
 # ## ex04.q3
 #
-# The paper's thresholds suit the paper's networks. A specialist of ours also remembers how well it
-# reconstructs **its own** training terrain; thresholds can be read off that: $\tau_{low}$ is the
-# loss that 90 % of the own patches stay below, $\tau_{high}$ **twice** the one that 99 % stay
-# below: a route over the own terrain has a hundred places, and needs every one of them.
+# The paper's thresholds suit the paper's networks. A specialist of ours was driven over held-out
+# terrain of its own kind, and remembers the losses it found there. Then a patch needs no threshold:
+# its **p-value** is the share of those own losses that are at least as large as its own loss, and
+# its weight is $\operatorname{clip}(p / \alpha, 0, 1)$. So at most a share of $\alpha$ of the own
+# terrain loses weight, whatever the network.
 
 
 # %%
-def calibrated_taus(losses):
-    """Return (tau_low, tau_high) from the losses [n] on a specialist's own terrain."""
+def conformal_weight(losses, own, alpha):
+    """Return the weight of each of `losses` [m]; `own` [n] are those on the own terrain."""
     # BEGIN SOLUTION
-    return np.quantile(losses, 0.9), 2 * np.quantile(losses, 0.99)
+    p = (own[None, :] >= losses[:, None]).mean(axis=1)
+    return np.clip(p / alpha, 0, 1)
     # END SOLUTION
 
 
 # %%
-check("ex04.q3", calibrated_taus)
+check("ex04.q3", conformal_weight)
 
 # %% [markdown]
 # ## ex04.q4

@@ -1,4 +1,4 @@
-"""Exercise 04, "Have I seen this before?": L_recon, w_ood, thresholds (paper, Eqs. 3-5)."""
+"""Exercise 04, "Have I seen this before?": L_recon, w_ood, p-values (paper, Eqs. 3-5)."""
 
 import numpy as np
 
@@ -19,6 +19,17 @@ def _losses(rng: np.random.Generator) -> tuple:
 
 def _weight(loss: np.ndarray, tau_low: float, tau_high: float) -> np.ndarray:
     return np.interp(loss, (tau_low, tau_high), (1.0, 0.0))
+
+
+def _own_losses(rng: np.random.Generator) -> tuple:
+    own = rng.lognormal(-1, 0.8, rng.integers(100, 200))
+    tail = np.sort(own)[-int(rng.integers(2, 5))]  # as strange as one of its own
+    losses = np.array([*rng.lognormal(-1, 0.8, 4), tail, 1.2 * tail, 2 * own.max()])
+    return losses, own, float(rng.choice([0.05, 0.1, 0.2]))
+
+
+def _share_beyond(losses: np.ndarray, own: np.ndarray) -> np.ndarray:
+    return 1 - np.searchsorted(np.sort(own), losses) / len(own)
 
 
 def _ceiling(f: float, f_min: float) -> float:
@@ -116,45 +127,52 @@ QUESTIONS = (
     ),
     Question(
         id="ex04.q3",
-        name="calibrated_taus",
+        name="conformal_weight",
         points=2,
-        title="thresholds from a specialist's own terrain",
-        expects="tau_low is the 90 % and tau_high twice the 99 % quantile of the own L_recon.",
-        draw=lambda rng: (rng.lognormal(-1, 0.8, rng.integers(60, 200)),),
-        truth=lambda losses: tuple(np.quantile(losses, (0.9, 0.99)) * (1, 2)),
+        title="a weight that means the same in every network",
+        expects="p is the share of the own losses that are at least as large as the loss; the "
+        "weight is p / alpha, and never above 1.",
+        draw=_own_losses,
+        truth=lambda losses, own, alpha: np.minimum(_share_beyond(losses, own) / alpha, 1.0),
         mistakes=(
             Mistake(
-                "the wrong tail: q10 and q5 are losses of the MOST familiar patches.",
-                lambda losses: tuple(np.quantile(losses, (0.1, 0.05)) * (1, 2)),
+                "the wrong tail: the share of own losses BELOW the loss grows with strangeness; "
+                "count those at least as large.",
+                lambda losses, own, alpha: np.minimum((1 - _share_beyond(losses, own)) / alpha, 1),
             ),
             Mistake(
-                "swapped taus: tau_low comes first and is the smaller one.",
-                lambda losses: tuple(np.quantile(losses, (0.99, 0.9)) * (2, 1)),
+                "p itself: it has to be divided by alpha, so that all but a share alpha of the own "
+                "terrain keeps full weight.",
+                lambda losses, own, alpha: _share_beyond(losses, own),
             ),
             Mistake(
-                "a forgotten factor: tau_high is TWICE the 99 % quantile: no hundredth of the own "
-                "terrain closes.",
-                lambda losses: tuple(np.quantile(losses, (0.9, 0.99))),
+                "a hard test: p >= alpha says familiar or not; between 0 and alpha the weight "
+                "should fall gradually.",
+                lambda losses, own, alpha: (_share_beyond(losses, own) >= alpha).astype(float),
             ),
             Mistake(
-                "shares of the largest loss: 0.9 * max is no quantile: one odd patch would move "
-                "both thresholds.",
-                lambda losses: (0.9 * losses.max(), 2 * 0.99 * losses.max()),
+                "a weight above 1: p / alpha is clipped to 1 where the patch is familiar.",
+                lambda losses, own, alpha: _share_beyond(losses, own) / alpha,
             ),
             Mistake(
-                "percent for shares: np.percentile counts to 100, np.quantile to 1.",
-                lambda losses: tuple(np.percentile(losses, (0.9, 0.99)) * (1, 2)),
+                "a count for a share: divide the number of own losses beyond by how many there "
+                "are (or take the mean).",
+                lambda losses, own, alpha: np.minimum(
+                    len(own) * _share_beyond(losses, own) / alpha, 1.0
+                ),
             ),
             Mistake(
-                "mean and standard deviation: losses are far from normal: use quantiles.",
-                lambda losses: (losses.mean() + losses.std(), losses.mean() + 2 * losses.std()),
+                "larger, not at least as large: an own patch is as strange as itself.",
+                lambda losses, own, alpha: np.minimum(
+                    np.mean(own > losses[:, None], axis=1) / alpha, 1.0
+                ),
             ),
         ),
         hints=(
-            "Nine tenths of the own patches should keep full weight.",
-            "np.quantile(losses, 0.9) is the loss that nine tenths stay below.",
+            "Compare every loss with every own loss: own[None, :] >= losses[:, None] is [m, n].",
+            "The mean of True and False along an axis is a share.",
+            "np.clip(p / alpha, 0, 1).",
         ),
-        rtol=1e-3,
     ),
     Question(
         id="ex04.q4",
