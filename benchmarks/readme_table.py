@@ -11,7 +11,7 @@ Use: python benchmarks/readme_table.py NAME FOLDER [FOLDER ...]
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -61,15 +61,14 @@ def block_of(folders: Sequence[Path]) -> str:
         runs.setdefault(caption, []).append(run)
     parts = []
     for caption, joined in tables.items():
-        _check([run["settings"] for run in runs[caption]])
+        _check([run["settings"] for run in runs[caption]], FREE)
         head, *lines = reduce(join, joined)
         parts += [markdown(head, lines), caption]
     every = [run for some in runs.values() for run in some]
-    commands = {run["settings"]["command"] for run in every}
-    if len(commands) > 1:
-        raise ReportError(f"the folders are of several commands: {', '.join(sorted(commands))}")
-    date = max(run["finished"] for run in every)[:10]
-    return "\n\n".join([*parts, f"*{trials:,} trials of `fgtutor {commands.pop()}`, {date}.*"])
+    settings = [run["settings"] for run in every]
+    _check(settings, {name for one in settings for name in one} - {"command"})
+    date, command = max(run["finished"] for run in every)[:10], settings[0]["command"]
+    return "\n\n".join([*parts, f"*{trials:,} trials of `fgtutor {command}`, {date}.*"])
 
 
 def join(one: list[list[str]], other: list[list[str]]) -> list[list[str]]:
@@ -81,8 +80,8 @@ def join(one: list[list[str]], other: list[list[str]]) -> list[list[str]]:
     raise ReportError("the folders' tables share neither their lines nor their columns")
 
 
-def _check(settings: Sequence[dict[str, Any]]) -> None:
-    """Raise `ReportError` unless all differ in whom they measured only."""
+def _check(settings: Sequence[dict[str, Any]], free: Set[str]) -> None:
+    """Raise `ReportError` if one differs from the first in more than `free`, or in a specialist."""
     first = settings[0]
     for later in settings[1:]:
         changed = {
@@ -90,7 +89,7 @@ def _check(settings: Sequence[dict[str, Any]]) -> None:
         }
         zoos = first.get("zoo", {}), later.get("zoo", {})
         retrained = {name for name in zoos[0].keys() & zoos[1] if zoos[0][name] != zoos[1][name]}
-        if wrong := (changed - FREE) | retrained:
+        if wrong := (changed - free) | retrained:
             raise ReportError(f"the folders differ in {', '.join(sorted(wrong))}: not one table")
 
 

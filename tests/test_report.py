@@ -145,13 +145,23 @@ def test_folders_of_other_policies_join_the_table(fill, folder, readme):
     assert head.format("ours") + "| steps | 99 |\n| gaps | 97 |\n\n" in readme.read_text()
 
 
+def test_folders_of_other_settings_have_a_table_below(fill, folder, readme):
+    paper = another(folder, table="| a |\n| --- |\n| 93 |", caption="Paper's, three", taus="paper")
+    fill("matrix", folder, paper)
+    assert (
+        "| a |\n| --- |\n| 100 |\n\nThree trials a cell.\n\n"
+        "| a |\n| --- |\n| 93 |\n\nPaper's, three trials a cell.\n\n*6 trials of"
+    ) in readme.read_text()
+
+
 @pytest.mark.parametrize(
     ("table", "settings", "words"),
     [
         ("| a |\n| --- |\n| 100 |", {"seed": 5}, "differ in seed"),
         ("| a |\n| --- |\n| 100 |", {"zoo": {"steps": "cd"}}, "differ in steps"),
         ("| b |\n| --- |\n| 7 |", {}, "neither"),
-        ("| a |\n| --- |\n| 100 |", {"caption": "Four"}, "Three trials a cell. / Four trials"),
+        ("| a |\n| --- |\n| 7 |", {"caption": "Four", "zoo": {"steps": "cd"}}, "differ in steps"),
+        ("| a |\n| --- |\n| 7 |", {"caption": "Four", "command": "x"}, "differ in command"),
     ],
 )
 def test_folders_that_are_not_of_one_table_do_not_join(

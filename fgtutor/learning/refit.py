@@ -84,7 +84,7 @@ def fit_head(
 ) -> None:
     """Fit the head of a net to what a specialist's says of patches met and of any ground.
 
-    Anywhere means anywhere: robots are sent by f, so where a head was not fitted it must not hope.
+    Planning asks about any ground, so the two must agree also where the policy never was.
     """
     anywhere = any_ground(specialist, seed)
     command = torch.tensor(specialist.command, dtype=torch.float32).expand(len(anywhere), -1)
