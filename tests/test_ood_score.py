@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fgtutor.errors import ThresholdError
+from fgtutor.errors import ConfigError, ThresholdError
 from fgtutor.feasibility import FeasibilityNet, OodScore, ood_weight
 from fgtutor.learning import refit, training
 from fgtutor.learning.calibrate import (
@@ -124,6 +124,11 @@ def test_a_new_autoencoder_knows_its_terrain_better(make_rolling, config):
     fresh = FeasibilityNet(net.num_points, vae_hidden=(16, 8), latent=3, saturation=0.2)
     flat = torch.zeros(1, net.num_points)
     assert net.reconstruction(flat) < fresh.reconstruction(flat)
+
+
+def test_a_smaller_head_without_updates_is_refused(config):
+    with pytest.raises(ConfigError, match="give --updates with --hidden"):
+        replace(config, hidden=(24, 12))
 
 
 def test_a_smaller_head_says_the_same_anywhere(config, monkeypatch):

@@ -19,6 +19,7 @@ from annotated_types import Interval
 from jaxtyping import Float
 from torch import Tensor
 
+from fgtutor.errors import ConfigError
 from fgtutor.feasibility import (
     LEVELS,
     FeasibilityNet,
@@ -72,6 +73,8 @@ class CalibrateConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.hidden and not self.updates:
+            raise ConfigError("a smaller head has to be fitted: give --updates with --hidden")
 
 
 @dataclass(frozen=True, eq=False)
