@@ -150,7 +150,7 @@ def save_specialist(specialist: Specialist, folder: str | Path) -> Path:
         raise SpecialistError(f"{folder} holds something else: choose another folder")
     where = specialist.name
     # Compared with what a reader will build: a folder that cannot be loaded is never written.
-    config, sizes = PolicyConfig.of(specialist.policy), _sizes_of(specialist.feasibility)
+    config, sizes = PolicyConfig.of(specialist.policy), sizes_of(specialist.feasibility)
     payloads = {}
     twins = _build(config, sizes, "meta", where)
     for file, module, twin in zip(TENSORS, _networks(specialist), twins, strict=True):
@@ -362,7 +362,7 @@ def _networks(specialist: Specialist) -> tuple[nn.Module, nn.Module]:
     return specialist.policy, specialist.feasibility
 
 
-def _sizes_of(net: FeasibilityNet) -> dict[str, Any]:
+def sizes_of(net: FeasibilityNet) -> dict[str, Any]:
     """Return the arguments that build a Feasibility-Net of this size."""
     return {name: getattr(net, name) for name in arguments(FeasibilityNet).__annotations__}
 

@@ -483,7 +483,7 @@ def test_a_resumed_run_equals_an_unbroken_one_bit_for_bit(robot, tmp_path):
 @pytest.mark.slow
 def test_an_estimating_run_starts_from_a_shipped_policy_and_resumes_exactly(tmp_path):
     options = {"actor": "estimating", "hidden": (256, 128), "critic_warmup": 1, "terrain": "steps"}
-    start = ZOO / "a1" / "steps"
+    start = ZOO / "a1" / "_checkpoints" / "late"  # whose Feasibility-Net is of its training
     config = A1TrainConfig(out=tmp_path / "a", start_from=start, **TINY | options)
     run, told = Trainer(config), load_specialist(start)
     own, theirs = (policy.mlp.state_dict() for policy in (run.algorithm.get_policy(), told.policy))

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from fgtutor.errors import CheckpointError, ConfigError, StorageError
-from fgtutor.feasibility import feasibility_labels
+from fgtutor.feasibility import FeasibilityNet, feasibility_labels
 from fgtutor.learning.checkpoints import read_checkpoint, write_checkpoint
 from fgtutor.learning.config import A1TrainConfig, TrainConfig, config_of, training_world
 from fgtutor.learning.trainer import Trainer
 from fgtutor.learning.training import train
-from fgtutor.specialist import load_specialist
+from fgtutor.specialist import load_specialist, save_specialist
 
 TINY = {
     "num_envs": 4,
@@ -250,6 +250,16 @@ def test_a_resumed_run_knows_what_it_started_from_and_goes_on_beyond_its_end(tra
     with pytest.raises(CheckpointError, match=r"start_from was '.*start', now '.*other'"):
         other = shutil.copytree(trained[0].folder / "specialist", tmp_path / "other")
         train(TrainConfig(**settings, start_from=other))
+
+
+@pytest.mark.parametrize("changed", [{}, {"hidden": (16, 8)}, {"height_scale": 6.0}])
+def test_a_refitted_feasibility_net_does_not_come_along(trained, tmp_path, changed):
+    start = load_specialist(trained[0].folder / "specialist")
+    net = FeasibilityNet(start.grid.num_points, **changed)
+    save_specialist(dataclasses.replace(start, feasibility=net), tmp_path / start.name)
+    trainer = Trainer(TrainConfig(out=tmp_path / "run", start_from=tmp_path / start.name, **TINY))
+    mine = trainer.algorithm.feasibility.state_dict()["decoder.4.bias"].cpu()
+    assert torch.equal(mine, net.state_dict()["decoder.4.bias"]) == (not changed)
 
 
 @pytest.mark.parametrize("part", ["", "specialist", "snapshots/25"])

@@ -29,7 +29,7 @@ from fgtutor.learning.distributed import leads
 from fgtutor.learning.ppo import FeasibilityPPO
 from fgtutor.policies.dreamwaq import EstimatingModel
 from fgtutor.robots.base import LocomotionEnv
-from fgtutor.specialist import Specialist, load_specialist, save_specialist
+from fgtutor.specialist import Specialist, load_specialist, save_specialist, sizes_of
 
 OUTGROWN = 0.45
 """Share of the way to the last row at which, on the mean, robots have outgrown the first one."""
@@ -100,7 +100,8 @@ class Trainer:
 
         From a run's folder, finished or not, its critic comes along; otherwise that is new, and
         learns first, alone, but for an estimator of the velocity, which learns all the while. On
-        the same terrain the Feasibility-Net comes along.
+        the same terrain the Feasibility-Net comes along, unless it was refitted with other widths
+        or units (as the shipped A1's were): then it begins anew.
         """
         checkpoint = folder / CHECKPOINT
         run = read_checkpoint(checkpoint) if checkpoint.exists() else None
@@ -125,7 +126,9 @@ class Trainer:
                 mine.load_state_dict(start.state_dict() | noise)
             if run and not told:
                 self.algorithm.critic.load_state_dict(run["algorithm"]["critic_state_dict"])
-            if specialist.name == self.config.terrain:
+            net = specialist.feasibility
+            alike = sizes_of(net) == sizes_of(self.algorithm.feasibility)
+            if specialist.name == self.config.terrain and alike:
                 self.algorithm.feasibility.load_state_dict(specialist.feasibility.state_dict())
         except (LookupError, RuntimeError) as error:
             raise CheckpointError(
