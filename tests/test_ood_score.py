@@ -89,7 +89,7 @@ def test_what_cannot_be_a_score_is_refused():
         OodScore(None, (OWN, OWN)).weight(torch.ones(3))
 
 
-def test_without_a_calibration_the_thresholds_are_those_of_training(make_specialist):
+def test_without_a_calibration_our_weights_are_refused(make_specialist):
     quantiles = {"0.9": 0.2, "0.99": 1.0}
     specialist = make_specialist(quantiles=quantiles, strangeness={})
     with pytest.raises(ThresholdError, match="never calibrated: run `fgtutor calibrate`"):

@@ -100,7 +100,7 @@ class CalibrationRow(TypedDict):
 
 
 @lru_cache(maxsize=16)
-def at_home(config: "CalibrationConfig", name: str) -> Rollout:
+def at_home(config: CalibrationConfig, name: str) -> Rollout:
     """Return what a specialist meets on its own terrain, driven once per process."""
     specialist = config.load_zoo()[name]
     return drive(specialist, specialist.provenance.get("terrain", name), config)
@@ -153,8 +153,9 @@ def strange_grounds(config: CalibrationConfig) -> list[str]:
     return names
 
 
+@lru_cache(maxsize=4)
 def patches_of(config: CalibrationConfig, ground: str, grid: PatchGrid) -> Rollout:
-    """Return patches cut anywhere on ground that nothing was trained on."""
+    """Return patches cut anywhere on ground that nothing was trained on, once per process."""
     rng = np.random.default_rng(config.seed)
     files = {path.stem: path for path in config.maps}
     if ground in files:

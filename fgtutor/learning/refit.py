@@ -52,7 +52,7 @@ def refitted(specialist: Specialist, met: "Rollout", config: "CalibrateConfig") 
             saturation=config.saturation,
         )
     if config.hidden:
-        fit_head(net, specialist, met, config.updates // 4)
+        fit_head(net, specialist, met, config.updates // 4, seed=config.seed)
     else:
         net.head.load_state_dict(old.head.state_dict())
         with torch.no_grad():  # the head reads heights in the new units
