@@ -2,8 +2,8 @@
 # touched, but for a browser that `make test` installs where it is root and finds none.
 #   make demo       plan and drive a mixed terrain with the shipped A1 specialists; writes demo/
 #   make test       every test          make test-fast  those that take under a minute together
-#   make lab        JupyterLab on the first notebook, on this machine only
-#   make notebooks  execute the notebooks' sources     make exercises  build them from their masters
+#   make lab        JupyterLab on your copy of the first notebook, on this machine only
+#   make notebooks  execute the notebooks' sources in full   make exercises  build them from their masters
 #   make test-wheel install wheel and source archive into fresh environments of each Python, and use them
 #   make bench      every benchmark, for an idle machine    make bench-quick  smaller sizes of each
 #   make check      lint, types, imports
@@ -36,12 +36,17 @@ browser:
 	  echo "Chromium could not be installed: the browser test will be skipped"; \
 	else echo "no Chromium and not root: the browser test will be skipped"; fi
 
+# Learners work on copies in my/, which git ignores: JupyterLab saves what it has open, and a tracked
+# notebook would then differ. A copy that is there is kept, with the work in it; delete it for a new one.
 # The server asks for its token and listens on the loopback address only. In a container one often
-# is root, which JupyterLab refuses unless told. It starts here, so that exercises/ is in sight.
+# is root, which JupyterLab refuses unless told.
 lab: $(ALL)
+	@mkdir -p my/notebooks my/exercises my/docs
+	@for file in notebooks/*.ipynb exercises/*.ipynb docs/*.md; do \
+	  [ -e "my/$$file" ] || cp "$$file" "my/$$file"; done
 	$(BIN)/jupyter lab --ip=127.0.0.1 $(if $(filter 0,$(shell id -u)),--allow-root) \
-	  --LabApp.default_url=/lab/tree/notebooks/01_elevation_maps.ipynb \
-	  --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate
+	  --LabApp.default_url=/lab/tree/my/notebooks/01_elevation_maps.ipynb \
+	  --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate --LabApp.news_url=None
 
 notebooks: $(ALL)
 	$(BIN)/fgtutor notebooks

@@ -143,7 +143,7 @@ def test_the_video_lasts_as_long_as_the_walk(episode, terrain, route, graphics, 
     _, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
     assert seconds == pytest.approx(2.0 + videos.HOLD, abs=0.2)
     strip = videos.film_strip(episode, terrain, route, count=3)
-    assert strip.size == (2 * 426 + 6, 2 * 266 + 6)
+    assert strip.image.size == (2 * 426 + 6, 2 * 266 + 6)
 
 
 @pytest.mark.slow

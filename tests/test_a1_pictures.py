@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from PIL import Image
 
 from fgtutor.course import a1_pictures
 from fgtutor.course.drives import straight_route
@@ -14,6 +13,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, RenderingError
 from fgtutor.execution import Episode, FollowConfig
 from fgtutor.figures.a1_film import VIEW
+from fgtutor.figures.style import Photo
 from fgtutor.robots.a1.env import A1_EPISODES, A1Env
 from fgtutor.robots.a1.model import LEGS, STANCE, STANCE_HEIGHT, build_spec
 from fgtutor.robots.offscreen import Renderer
@@ -112,6 +112,25 @@ def test_a_stick_figure_shows_tilt_and_forgets_place_and_yaw(stance):
     assert len(figure.legends[0].get_texts()) == 4
 
 
+def test_nearer_legs_hide_farther_ones(stance):
+    figure = a1_pictures.draw_postures({"standing": stance})
+    for row, near in ((0, {"FR", "RR"}), (1, {"FR", "FL"})):
+        lines = [line for line in figure.axes[row].lines if line.get_marker() == "."]
+        order = {leg: line.get_zorder() for leg, line in zip(LEGS, lines, strict=True)}
+        assert {leg for leg, z in order.items() if z == max(order.values())} == near
+        (trunk,) = (line for line in figure.axes[row].lines if line.get_marker() == "None")
+        assert min(order.values()) < trunk.get_zorder() < max(order.values())
+
+
+def test_the_plane_of_the_feet_tilts_with_the_robot(stance):
+    uphill = stance.copy()
+    uphill[3:7] = (np.cos(0.2), 0.0, -np.sin(0.2), 0.0)  # the nose up by 0.4 rad
+    figure = a1_pictures.draw_postures({"": uphill}, plane=True)
+    aside, front = (axes.lines[0].get_xydata() for axes in figure.axes[:2])
+    slopes = [(end[1] - start[1]) / (end[0] - start[0]) for start, end in (aside, front)]
+    assert slopes == pytest.approx([np.tan(0.4), 0.0], abs=0.02)
+
+
 # Walks and views ----------------------------------------------------------------------------------
 
 
@@ -128,8 +147,8 @@ def test_without_graphics_a_walk_is_shown_as_sticks(walk, flat, no_graphics, cap
 @pytest.mark.slow
 def test_with_graphics_a_walk_is_a_film_strip_no_wider_than_a_page(walk, flat, graphics):
     shown = a1_pictures.show_walk(walk, flat, straight_route(flat, "steps"), count=3)
-    assert isinstance(shown, Image.Image) and shown.width == a1_pictures.PAGE
-    assert np.ptp(np.asarray(shown)) > 150
+    assert isinstance(shown, Photo) and shown.image.width == a1_pictures.PAGE
+    assert np.ptp(np.asarray(shown.image)) > 150 and "reached" in shown.alt
 
 
 def test_sticks_need_a_recorded_body(walk):

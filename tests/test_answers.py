@@ -2,13 +2,15 @@
 
 import json
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fgtutor.course.checks import find
-from fgtutor.course.checks.question import CRASHED, WRONG, Judge
+from fgtutor.course.checks import EXERCISES, find, questions_of
+from fgtutor.course.checks.question import CRASHED, PASSED, WRONG, Judge
 from fgtutor.course.grading.answers import decode, difference, encode
+from fgtutor.course.grading.replies import reply_of
 from fgtutor.errors import ConfigError
 
 Q1, Q3 = "ex10.q1", "ex10.q3"
@@ -62,12 +64,57 @@ def test_a_text_among_numbers_takes_no_more_memory_than_it_has():
     assert verdict.outcome == WRONG
 
 
-@pytest.mark.parametrize(
-    "answer", ["x", {"list": [1.0, 2.0]}, {"list": ["x", 1]}, {"list": []}, 1.5]
-)
-def test_no_wrong_answer_is_told_the_number_to_find(answer):
-    detail = Judge(find(Q3), None).judge({"answers": [answer]}).detail
-    assert "5.0" not in detail
+NUMBERS = [q for exercise in EXERCISES for q in questions_of(exercise) if q.draw is None]
+KINDS = [
+    "x", "", b"x", [1.0, 2.0], (1, 2), ["x", 1], [], [[1.0], [2.0]], [[1.0, 2.0], [3.0]], 1.5, -1,
+    True, float("nan"), float("inf"), 1j, 2**70, {}, {"a": 1}, {1}, object(), print, None, ...,
+    np.zeros(3), np.zeros((2, 2)), np.array([]), np.array("x"), np.array([None]), np.float32(1.5),
+    np.array([1j]), [[[[[[1]]]]]], [None], "1.0", range(3), Exception("x"), np.datetime64("2020"),
+]  # fmt: skip
+"""Answers of every kind to a question for a number."""
+
+
+@pytest.mark.parametrize("question", NUMBERS, ids=lambda question: question.id)
+def test_no_wrong_answer_is_told_the_number_to_find(question):
+    """Whatever differs, type or size or shape, nothing is said that follows from the number.
+
+    The same is said when the number to find is another one: so it cannot tell anything about it.
+    """
+    truth = question.truth()
+    others = [replace(question, truth=lambda k=k: truth * k, mistakes=()) for k in (1, 3.7, -11.3)]
+    for answer in KINDS:
+        reply = reply_of(answer, None, 5.0)
+        said = {Judge(other, None, tell=False).judge(reply).detail for other in others}
+        assert len(said) == 1, answer
+        assert Judge(question, None).judge(reply).outcome != PASSED
+
+
+def test_nothing_of_a_secret_array_is_told():
+    secret = np.array([[12.5, 13.5]])
+    for got in (None, "x", [1, 2], np.zeros((2, 1)), np.zeros((1, 2)), 1j, 3.0, [[1], [2, 3]]):
+        for expected in (secret, (secret, 14.5)):
+            text = difference(expected, got, show=False)
+            assert text and not {"12.5", "13.5", "14.5", "(1, 2)"} & {*text.split()}
+            assert "axes" not in text
+
+
+def test_tensors_cross_as_arrays_and_cases_as_tensors():
+    torch = pytest.importorskip("torch")
+    tensor = torch.tensor([1.0, 2.0], requires_grad=True)
+    np.testing.assert_equal(decode(encode(tensor)), np.array([1, 2], dtype=np.float32))
+    back = decode(json.loads(json.dumps(encode((tensor, 3), tensors=True))), tensors=True)
+    assert isinstance(back[0], torch.Tensor) and back[0].tolist() == [1.0, 2.0] and back[1] == 3
+    with pytest.raises(ConfigError):  # what a submission sends is never a tensor
+        decode(encode(tensor, tensors=True))
+
+
+def test_the_heading_that_is_drawn_is_named():
+    expected = np.zeros((3, 3, 8))
+    got = expected.copy()
+    got[0, 0, 3] = got[1, 1, 3] = got[2, 2, 5] = 1.0
+    text = difference(expected, got)
+    assert "heading 3 (-x+y), [:, :, 3], which has the most of all 8" in text
+    assert text.endswith("...\n.x.\nx..")
 
 
 def test_a_deep_reply_is_unreadable_not_an_end():

@@ -8,9 +8,11 @@ import networkx
 import numpy as np
 import pytest
 import torch
+from scipy.interpolate import RegularGridInterpolator
+from scipy.stats import binomtest
 
 from fgtutor import patches
-from fgtutor.course.checks import ex08_a1, find
+from fgtutor.course.checks import ex08_a1, find, nets
 from fgtutor.directions import STEPS, YAWS
 from fgtutor.elevation import ElevationMap
 from fgtutor.feasibility import OodScore, feasibility_labels, ood_weight, tracking_reward
@@ -39,18 +41,23 @@ def test_cells_are_those_of_the_map():
         assert ours.tolist() == [list(grid.cell_of(*point)) for point in xy[inside]]
 
 
-def test_ground_is_that_of_the_patch_grid():
-    grid = patches.PatchGrid(ahead=0.3, behind=0.3, half_width=0.2, footprint=(0.1, 0.1))
-    for patch, footprint in cases("ex01.q2"):
-        flat = torch.from_numpy(patch).flatten()
-        expected = (flat - patches.ground_height(flat, grid)).reshape(grid.shape)
-        np.testing.assert_allclose(answer("ex01.q2", patch, footprint), expected)
-
-
 def test_patch_points_are_those_of_the_library():
-    for offsets, pose in cases("ex01.q3"):
+    for offsets, pose in cases("ex01.q2"):
         turned = patches.rotate(torch.from_numpy(offsets), torch.tensor(pose[2]).double())
-        np.testing.assert_allclose(answer("ex01.q3", offsets, pose), turned.numpy() + pose[:2])
+        np.testing.assert_allclose(answer("ex01.q2", offsets, pose), turned.numpy() + pose[:2])
+
+
+def test_a_cut_patch_is_bilinear_between_the_centres():
+    for heights, origin, resolution, pose, offsets, under in cases("ex01.q3"):
+        centres = tuple(
+            o + (np.arange(n) + 0.5) * resolution
+            for o, n in zip(origin, heights.shape, strict=True)
+        )
+        bilinear = RegularGridInterpolator(centres, heights, bounds_error=False)
+        expected = bilinear(answer("ex01.q2", offsets, pose))
+        ours = answer("ex01.q3", heights, origin, resolution, pose, offsets, under)
+        np.testing.assert_allclose(ours, expected - np.median(expected[under]))
+        assert np.isnan(ours).any() and not np.isnan(ours[under]).any()
 
 
 def test_rise_by_a_loop():
@@ -89,29 +96,34 @@ def test_returns_and_objective_by_hand():
     assert answer("ex02.q4", ratio, advantage, 0.2) == pytest.approx(-0.4)
 
 
-def test_feasibility_loss_by_hand():
-    # (0.5 - 1)^2 = 0.25 and 0: mean 0.125; recon mean 2, kl mean 10: 3 (2 + 0.1 * 10) = 9.
-    f, r_v = np.array([0.5, 1.0]), np.array([1.0, 1.0])
-    loss = answer("ex03.q1", f, r_v, np.array([1.0, 3.0]), np.array([0.0, 20.0]), 3.0, 0.1)
-    assert loss == pytest.approx(9.125)
-
-
-def test_divergence_is_that_of_torch():
-    for mean, log_variance in cases("ex03.q2"):
-        scale = torch.tensor(log_variance / 2).exp()
-        ours, prior = (
-            torch.distributions.Normal(torch.tensor(mean), scale),
-            torch.distributions.Normal(0.0, 1.0),
-        )
-        expected = torch.distributions.kl_divergence(ours, prior).sum(-1)
-        np.testing.assert_allclose(answer("ex03.q2", mean, log_variance), expected, atol=1e-12)
+def test_joint_loss_is_the_library_s():
+    (patch, command, r_v, noise, alpha, beta, weights) = cases("ex03.q2")[0]
+    net = nets.build_net(patch.shape[1], command.shape[1], nets.HIDDEN, nets.LATENT).double()
+    torch.nn.utils.vector_to_parameters(torch.tensor(weights), net.parameters())
+    given = [torch.tensor(array) for array in (patch, command, r_v)]
+    # Without noise the library's loss in evaluation mode, where the latent is the mean.
+    expected, _ = net.eval().loss(*given, alpha=alpha, beta=beta)
+    ours = answer("ex03.q2", net, *given, torch.zeros(noise.shape), alpha, beta)
+    assert float(ours.detach()) == pytest.approx(float(expected.detach()))
 
 
 def test_calibration_is_the_library_s():
     for predicted, measured, bins in cases("ex03.q3"):
         table, error = calibration(predicted, measured, bins)
-        np.testing.assert_allclose(answer("ex03.q3", predicted, measured, bins), table)
-        assert answer("ex03.q4", table) == pytest.approx(error)
+        ours = answer("ex03.q3", predicted, measured, bins)
+        np.testing.assert_allclose(ours[0], table)
+        assert ours[1] == pytest.approx(error)
+
+
+def test_rollout_labels_are_the_library_s():
+    for r_v, failed, ended, window in cases("ex03.q4"):
+        # The library's row t tells of the step that led to time t: one row more at the start.
+        rows = np.stack((r_v, failed, ended), axis=-1)
+        rows = torch.tensor(np.concatenate((np.zeros((1, *rows.shape[1:])), rows)))
+        labels, trusted = feasibility_labels(rows, window)
+        ours = answer("ex03.q4", r_v, failed, ended, window)
+        np.testing.assert_allclose(ours[0], labels[:-1], rtol=1e-6)
+        np.testing.assert_array_equal(ours[1], trusted[:-1])
 
 
 def test_reconstruction_loss_is_the_network_s(make_specialist):
@@ -139,12 +151,17 @@ def test_weights_and_taus_are_the_library_s():
     assert 0.9 * ood_weight(answer("ex04.q4")) == pytest.approx(0.1)
 
 
-def test_windows_and_first_layer_are_those_of_torch():
-    for heights, rows, columns in cases("ex05.q1"):
-        ours = answer("ex05.q1", heights, rows, columns)
-        for i, j in np.ndindex(ours.shape[:2]):
-            window = heights[i : i + rows, j : j + columns]
-            np.testing.assert_array_equal(ours[i, j], window.ravel())
+def test_a_window_lies_ahead_of_its_cell_by_hand():
+    # On a slope that rises by 1 per cell along x, the middle of three rows lies 1 higher along +x,
+    # 1 lower along -x, and level along y.
+    heights = np.arange(5.0)[:, None] * np.ones((1, 5))
+    tensor = answer("ex05.q1", heights, 3, 3, lambda windows: windows[:, 4])
+    assert tensor[2, 2].tolist() == [1.0, 0.0, -1.0, 0.0]
+    # The windows of a corner leave the map.
+    assert tensor[0, 0].tolist() == [0.0] * 4
+
+
+def test_the_first_layer_is_that_of_torch():
     for heights, kernel, bias in cases("ex05.q2"):
         convolved = torch.nn.functional.conv2d(
             torch.tensor(heights)[None, None], torch.tensor(kernel)[None, None]
@@ -194,7 +211,38 @@ def test_cheapest_is_dijkstra_s():
         expected = networkx.single_source_dijkstra_path_length(graph, start).get(goal, math.inf)
         assert answer("ex06.q3", costs, start, goal) == pytest.approx(expected)
         reached += math.isfinite(expected)
-    assert reached >= 5
+    assert 5 <= reached < len(cases("ex06.q3"))
+
+
+def test_the_cheapest_route_costs_what_dijkstra_says():
+    for costs, start, goal in cases("ex06.q5"):
+        cells = answer("ex06.q5", costs, start, goal)
+        cost = answer("ex06.q3", costs, start, goal)
+        assert math.isfinite(cost) == (len(cells) > 0)
+        if len(cells):
+            assert (*cells[0], *cells[-1]) == (*start, *goal)
+            with np.errstate(divide="ignore"):
+                assert answer("ex06.q4", 1 / costs, cells) == pytest.approx(cost)
+
+
+def test_a_plan_with_switches_is_dijkstra_s():
+    for tensors, f_min, switch_cost, start, goal in cases("ex06.q6"):
+        graph = networkx.DiGraph()
+        for policy, tensor in enumerate(tensors):
+            moves = as_networkx(tensor, np.full(tensor.shape, policy), f_min=f_min)
+            for cell, onward, edge in moves.edges(data=True):
+                graph.add_edge((*cell, policy), (*onward, policy), weight=edge["weight"])
+        pairs = list(itertools.permutations(range(len(tensors)), 2))
+        for cell in np.ndindex(tensors.shape[1:3]):
+            for old, new in pairs:
+                graph.add_edge((*cell, old), (*cell, new), weight=switch_cost)
+        expected = math.inf
+        for first, last in itertools.product(range(len(tensors)), repeat=2):
+            lengths = networkx.single_source_dijkstra_path_length(graph, (*start, first))
+            expected = min(expected, lengths.get((*goal, last), math.inf))
+        assert answer("ex06.q6", tensors, f_min, switch_cost, start, goal) == pytest.approx(
+            expected
+        )
 
 
 def test_route_cost_is_that_of_the_planned_route():
@@ -236,16 +284,20 @@ def test_gravity_is_turned_as_mujoco_turns_it():
             np.testing.assert_allclose(ours, expected, atol=1e-9)
 
 
-def test_torques_rewards_and_mirror_by_hand():
+def test_torques_and_mirror_by_hand():
     # Target 0.9 + 0.5 * 0.2 = 1.0: 35 * 0.1 - 0.5 * 2 = 2.5; far away, the limit.
     q, dq = np.array([0.9, -5.0]), np.array([2.0, 0.0])
     torque = answer("ex08.q1", q, dq, np.array([0.2, 0.0]), np.array([0.9, 0.9]))
     assert torque == pytest.approx([2.5, 33.5])
     joints = np.arange(12.0)[None]
     assert answer("ex08.q3", joints)[0].tolist() == [-3, 4, 5, -0.0, 1, 2, -9, 10, 11, -6, 7, 8]
-    # 1 * 2 - 3 * 1 < 0 counts 0; 1 * 2 - 1 = 1 earns 0.02.
-    terms, weights = np.array([[1.0, 3.0], [1.0, 1.0]]), np.array([2.0, -1.0])
-    assert answer("ex08.q4", terms, weights, 0.02) == pytest.approx([0.0, 0.02])
+
+
+def test_a_joint_swings_as_by_hand():
+    # kp = 1, inertia 1, dt = 0.5, no damping: dq = 0.5, q = 0.25; dq = 0.875, q = 0.6875.
+    angles, over, settled = answer("ex08.q4", 1.0, 1.0, 1.0, 0.0, 9.0, 0.5, 2)
+    assert angles == pytest.approx([0.25, 0.6875])
+    assert over == 0.0 and math.isnan(settled)
 
 
 def test_curriculum_advantages_and_rate_by_hand():
@@ -260,6 +312,21 @@ def test_curriculum_advantages_and_rate_by_hand():
     assert advantage == pytest.approx([-2.25, -1.0, 2.0])
     rates = [answer("ex09.q3", 1e-3, kl, 0.01) for kl in (0.021, 0.0049, 0.01)]
     assert rates == pytest.approx([1e-3 / 1.5, 1.5e-3, 1e-3])
+
+
+def test_batch_advantages_of_one_robot_are_generalised_advantages():
+    for rewards, values, next_values, fell, timed_out, gamma, lam in cases("ex09.q4"):
+        ours = answer("ex09.q4", rewards, values, next_values, fell, timed_out, gamma, lam)
+        assert (ours.mean(), ours.std()) == pytest.approx((0.0, 1.0))
+        # Equal worth from one step to the next, and no time-out: the case of ex09.q2.
+        chained = np.concatenate((values[1:], next_values[-1:]))
+        ours = answer("ex09.q4", rewards, values, chained, fell, fell & False, gamma, lam)
+        single = [
+            answer("ex09.q2", r, np.append(v, n), f, gamma, lam)
+            for r, v, n, f in zip(rewards.T, values.T, next_values[-1], fell.T, strict=True)
+        ]
+        expected = np.stack(single, axis=-1)
+        np.testing.assert_allclose(ours, (expected - expected.mean()) / expected.std())
 
 
 def test_lengths_spl_and_table_one():
@@ -281,17 +348,26 @@ def test_intervals_are_the_library_s():
     assert wilson_interval(needed, needed)[0] > 0.99 > wilson_interval(needed - 1, needed - 1)[0]
 
 
-def test_success_table_and_metres_by_hand():
+def test_success_table_and_paired_test_by_hand():
     # Terrain 0, policy 0: reached, no route -> 1/2; terrain 1, policy 1: a fall -> 0.
     table = answer("ex11.q2", np.array([0, 0, 1]), np.array([0, 0, 1]), np.array([0, 1, 2]), 2, 2)
     assert table == pytest.approx(np.array([[0.5, np.nan], [np.nan, 0.0]]), nan_ok=True)
-    metres = answer("ex11.q3", np.array([0, 1, 2]), np.array([0, 2, 0]), 4, 0.5)
-    assert metres == pytest.approx([1.0, 0.0, 0.5 * math.sqrt(2), 0.0])
+    for first, second in cases("ex11.q3"):
+        wins, losses, p = answer("ex11.q3", first, second)
+        if wins + losses:
+            assert p == pytest.approx(binomtest(wins, wins + losses).pvalue)
+    # Walks of 2 m and 3 m, the second one too long for its reference of 1.5 m: SPL (1 + 0.5) / 2.
+    xy = np.array([[[0, 0], [2, 0], [np.nan] * 2], [[0, 0], [0, 2], [0, 3]]], dtype=float)
+    table = answer("ex11.q5", np.zeros(2, int), np.ones(2, bool), xy, np.array([2.0, 1.5]), 2)
+    expected = np.array([[2.5, 1.0, 0.75], [np.nan] * 3])
+    np.testing.assert_allclose(table, expected)
 
 
 def test_raster_and_noise_by_hand():
-    points = np.array([[0.05, 0.15, -0.3], [0.01, 0.11, -0.1], [0.15, 0.05, -0.2]])
-    raster = answer("ex12.q1", points, (2, 2), 0.1)
+    # Two points of one cell 20 cm apart support no height, and one beside the map has none.
+    points = [[0.05, 0.15, -0.3], [0.01, 0.11, -0.1], [0.15, 0.05, -0.2], [0.16, 0.07, -0.22]]
+    points = np.array([*points, [0.05, 0.16, -0.12], [0.25, 0.05, 1.0]])
+    raster = answer("ex12.q1", points, (2, 2), 0.1, 2)
     assert raster == pytest.approx(np.array([[np.nan, -0.1], [-0.2, np.nan]]), nan_ok=True)
     # 3 cm fix, 2 cm per root second: after 4 s, sqrt(9 + 16) = 5 cm.
     assert answer("ex12.q2", np.array([4.0]), 0.03, 0.02) == pytest.approx([0.05])

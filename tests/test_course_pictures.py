@@ -90,6 +90,15 @@ def test_heading_maps_are_upright_and_in_their_places(ledge):
     assert shown[:, -1].min() == 1.0 and shown[:, :-1].max() == 0.0
 
 
+def test_tensors_lie_side_by_side_in_one_scale(ledge):
+    left, right = np.zeros((20, 20, 8)), np.ones((20, 20, 8))
+    left[19, :, :4] = 1.0  # half of the headings, in the last column of cells along x
+    figure = patch_pictures.feasibility_maps({"early": left, "late": right}, ledge)
+    early, late = images(figure)[:2]
+    assert early[:, -1].min() == 0.5 and early[:, :-1].max() == 0.0 and late.min() == 1.0
+    assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == ["early", "late"]
+
+
 # Graphs and routes --------------------------------------------------------------------------------
 
 
@@ -143,6 +152,26 @@ def test_the_difference_of_maps_is_unknown_where_the_scan_is():
 
 
 # Charts -------------------------------------------------------------------------------------------
+
+
+def test_the_error_of_a_scan_is_white_where_there_is_none():
+    truth = ElevationMap(np.full((4, 3), 0.3))
+    scan = ElevationMap(np.where(np.arange(12).reshape(4, 3) < 8, 0.35, 0.3))
+    axes = cloud_pictures.draw_error(scan, truth).axes[0]
+    shown = np.asarray(axes.images[0].get_array())
+    np.testing.assert_allclose(shown[0, 3], maps.GROUND(0.5)[:3], atol=0.06)
+    assert "minus the truth" in axes.get_title(loc="left")
+
+
+def test_curves_differ_in_dashes_and_may_jump_over_a_logarithmic_axis():
+    curves = {"a": [1, 2], "b": [2, 3]}
+    figure = charts.draw_curves(
+        [1, 10], curves, title="t", xlabel="x", ylabel="y", log_x=True, steps=True
+    )
+    first, second = figure.axes[0].lines
+    assert first.get_linestyle() != second.get_linestyle()
+    assert first.get_drawstyle() == "steps-mid"
+    assert figure.axes[0].get_xscale() == "log" and figure.axes[0].get_yscale() == "linear"
 
 
 def test_a_policy_keeps_its_colour_and_strangers_take_turns():

@@ -66,6 +66,23 @@ def test_a_toy_draws_itself_and_others_are_drawn(make_rolling, make_specialist):
         Drive(terrain, {})
 
 
+def test_a_drive_begins_with_the_policy_of_its_ground_in_its_colour(make_rolling):
+    class View:
+        coat = (0.0, 0.0, 0.0)
+
+        def __call__(self, env):
+            return np.full((4, 6, 3), np.round(255 * np.array(self.coat)), np.uint8)
+
+    zoo = {name: make_rolling(name) for name in ("bridge", "steps")}
+    drive = Drive(make_terrain("steps", robot="toy"), zoo, render=View())
+    assert drive.policy == "steps"
+    for name in ("steps", "bridge"):
+        drive.policy = name
+        colour = 255 * np.array(to_rgb(style.POLICY_COLOURS[name]))
+        np.testing.assert_allclose(drive.frame()[0, 0], colour, atol=1)
+    assert Drive(make_terrain("flat", robot="toy"), zoo).policy == "bridge"  # the first of them
+
+
 def test_a_drive_refuses_commands_without_meaning(make_rolling):
     drive = Drive(make_terrain("flat", robot="toy"), {"steps": make_rolling()})
     drive.speed = float("nan")

@@ -9,10 +9,12 @@ from matplotlib.colors import to_rgb
 
 from fgtutor import directions
 from fgtutor.course.widgets.explorer import Explorer
-from fgtutor.course.widgets.panels import on_picture, upright
+from fgtutor.course.widgets.panels import on_picture, unknown_boxes, upright
+from fgtutor.course.widgets.scene_figure import scene_figure
 from fgtutor.course.widgets.tau_pictures import TAU_CHOICES, TauPictures, tau_figure
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, OffMapError, ThresholdError
+from fgtutor.feasibility import ood_weight
 from fgtutor.figures import maps, style
 from fgtutor.planning import plan_on_map
 from fgtutor.settings import PAPER, PlanSettings
@@ -221,6 +223,70 @@ def test_a_route_is_cut_where_the_policy_changes():
     explorer.update(goal=explorer.start)
     assert not TauPictures(explorer).scene().lines
     assert explorer.status.endswith("cost 0.00, 0.00 m, policy switches: 0")
+
+
+def test_a_policy_taken_away_loses_its_colour():
+    grid, said = random_world(6)
+    explorer = Explorer(grid, said, *corners(grid), taus=(0.1, 9.0), policies=("steps", "slopes"))
+    scene = TauPictures(explorer).scene()
+    grey = scene.pictures["w gaps"].astype(int)
+    assert (grey.max(axis=-1) == grey.min(axis=-1)).all()
+    colourful = scene.pictures["w steps"].astype(int)
+    assert (colourful.max(axis=-1) - colourful.min(axis=-1)).max() > 50
+    titles = [panel.title for panel in scene.rows[1]]
+    assert titles == ["w_ood of steps", "w_ood of gaps, taken away", "w_ood of slopes"]
+    assert scene.charts[1].colour == "#999999" != scene.charts[0].colour
+
+
+@pytest.mark.parametrize("taus", [(0.3, 1.0), "paper"])
+def test_a_chart_counts_the_losses_and_weighs_them(taus):
+    grid, said = random_world(6, shape=(30, 20))
+    explorer = Explorer(grid, said, *corners(grid), taus=taus)
+    chart = TauPictures(explorer).scene().charts[0]
+    assert sum(chart.shares) == pytest.approx(1)
+    low, high = chart.span
+    losses = said["steps"].reconstruction.numpy()[grid.known]
+    half = 10 ** ((low + high) / 2)
+    below = sum(chart.shares[: len(chart.shares) // 2])
+    assert below == pytest.approx((losses < half).mean(), abs=0.002)
+    at = np.logspace(low, high, len(chart.weights))
+    pair = (0.1, 2.0) if taus == "paper" else taus
+    np.testing.assert_allclose(chart.weights, ood_weight(at, *pair), atol=1e-4)
+    assert chart.home == []  # numbers made by hand have no ground of their own
+
+
+def test_a_calibrated_chart_knows_the_policys_own_ground(make_specialist):
+    grid = ElevationMap(np.random.default_rng(0).normal(0, 0.05, (30, 20)))
+    specialist = make_specialist("steps")
+    explorer = Explorer(grid, {"steps": specialist}, *corners(grid), taus="calibrated")
+    chart = TauPictures(explorer).scene().charts[0]
+    own = specialist.quantiles
+    assert chart.home == [
+        pytest.approx(np.log10(own[p])) for p in ("0.5", "0.9", "0.99") if p in own
+    ]
+    assert chart.weights[0] == 1 and chart.weights == sorted(chart.weights, reverse=True)
+
+
+def test_unknown_cells_are_hatched_where_they_lie():
+    heights = np.zeros((5, 4))
+    heights[1:3, 3] = heights[4, 0] = np.nan
+    grid = ElevationMap(heights)
+    # The last y is the upper row of the picture, the first y the lowest of its four.
+    assert unknown_boxes(grid) == [(1.0, 0.0, 3.0, 1.0), (4.0, 3.0, 5.0, 4.0)]
+
+
+def test_the_scene_on_a_page_has_its_panels_and_metres():
+    grid, said = random_world(6)
+    explorer = Explorer(grid, said, *corners(grid), taus=(0.1, 3.0))
+    scene = TauPictures(explorer).scene()
+    figure = scene_figure(scene)
+    panels = [panel for row in scene.rows for panel in row]
+    assert len(figure.axes) == len(panels) + len(scene.charts)
+    for axes, panel in zip(figure.axes, panels, strict=False):
+        assert axes.get_title(loc="left") == panel.title
+        assert axes.get_xlim() == (-1.0, 3.5) and axes.get_ylim() == (2.0, 5.5)
+        assert "(m)" in axes.get_xlabel() and axes.get_ylabel() == "y (m)"
+    assert scene.status in figure.alt
 
 
 def test_the_still_picture_leaves_the_explorer_alone():

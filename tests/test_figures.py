@@ -1,6 +1,8 @@
 """Pictures and videos: what they show, what they refuse, and that nothing partial is left."""
 
 import errno
+import io
+import itertools
 import subprocess
 import sys
 import threading
@@ -19,7 +21,7 @@ from PIL import Image
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, StorageError
 from fgtutor.execution import Episode
-from fgtutor.figures import charts, maps, style, toy_film, videos
+from fgtutor.figures import charts, maps, relief, style, toy_film, videos
 from fgtutor.fusion import fuse
 from fgtutor.planning import Plan, plan
 from fgtutor.statistics import Share, calibration
@@ -109,6 +111,70 @@ def test_elevation_puts_x_to_the_right_and_y_up(ground):
     assert figure.axes[0].images[0].get_extent() == pytest.approx([0, 0.4, 0, 0.3])
 
 
+def test_the_commonest_height_is_white_and_the_bar_names_both_ends():
+    heights = np.zeros((10, 10))
+    heights[2:5], heights[5:8] = 0.1, 0.25  # of the cells 40 % lie at 0: the median is 0.1
+    elevation = ElevationMap(heights + 3.0)
+    assert relief.usual_height(elevation) == pytest.approx(3.0)
+    picture = maps.draw_elevation(elevation)
+    axes = picture.axes[0]
+    white = np.asarray(maps.GROUND(0.5))[:3]
+    np.testing.assert_allclose(np.asarray(axes.images[0].get_array())[5, 0], white, atol=0.01)
+    picture.canvas.draw()
+    (bar,) = axes.child_axes
+    named = [float(text.get_text()) for text in bar.get_yticklabels()]
+    assert bar.get_ylim() == pytest.approx((3.0, 3.25))
+    assert named[0] == 3.0 and named[-1] == 3.25 and named == sorted(set(named))
+
+
+def test_a_map_says_what_it_is_told_and_what_is_hatched(ground):
+    axes = maps.draw_elevation(ground, title="A ledge", caption="Look", label="error (m)").axes[0]
+    assert axes.get_title(loc="left") == "A ledge"
+    assert axes.get_xlabel() == "x (m)\nLook. Hatched: never observed"
+    assert axes.child_axes[0].get_ylabel() == "error (m)"
+    known = ElevationMap(np.eye(4))
+    assert "never observed" not in maps.draw_elevation(known).axes[0].get_xlabel()
+
+
+@pytest.mark.parametrize("heights", [np.zeros((4, 4)), np.pad([[9.0]], 2)])
+def test_ticks_of_heights_do_not_touch(heights):
+    picture = maps.draw_elevation(ElevationMap(heights))
+    picture.canvas.draw()
+    boxes = [
+        text.get_window_extent()
+        for text in picture.axes[0].child_axes[0].get_yticklabels()
+        if text.get_text()
+    ]
+    assert len(boxes) >= 2
+    assert all(low.y1 <= high.y0 for low, high in itertools.pairwise(boxes))
+
+
+def test_a_picture_brings_alt_text_and_cuts_no_word_off():
+    long = "A title that is far too long for so narrow a picture, and yet must be read"
+    picture = style.Picture(4.0, 2.0)
+    picture.subplots().set_title(long, loc="left")
+    data, words = picture._repr_mimebundle_()
+    assert words["image/png"]["alt"] == long
+    with Image.open(io.BytesIO(data["image/png"])) as image:
+        assert image.width > 1.2 * 4.0 * style.DPI
+    picture.alt = "Better words"
+    assert picture._repr_mimebundle_()[1] == {"image/png": {"alt": "Better words"}}
+
+
+def test_alt_text_names_every_panel_and_legend(ground, planned):
+    weights = {name: torch.ones(40, 10, 8) for name in NAMES}
+    alt = maps.plan_figure(ground, replace(planned, weights=weights)).described()
+    for part in (
+        "1 The route",
+        "w_ood of each policy",
+        "3 F as petals",
+        "4 Policy map",
+        "steps",
+    ):
+        assert part in alt
+    assert len(alt) <= style.LONGEST and "\n" not in alt and "$" not in alt
+
+
 def test_unknown_cells_are_hatched(ground):
     (hatched,) = (
         c for c in maps.draw_elevation(ground).axes[0].collections if c.get_hatch() is not None
@@ -171,7 +237,7 @@ def test_a_petal_points_along_its_heading_and_is_as_long_as_f():
     tip = petal.vertices[petal.vertices[:, 1].argmax()]
     # Centre (1.5, 1.5), and a petal of F = 1 reaches 0.56 cells far.
     assert tip == pytest.approx((1.5, 1.5 + 0.5 * 0.56))
-    np.testing.assert_allclose(petals.get_facecolor()[0, :3], to_rgb(style.HEADING_COLOURS[2]))
+    np.testing.assert_allclose(petals.get_facecolor()[0, :3], to_rgb(maps.FEASIBLE))
 
 
 def test_petals_turn_with_the_map():
@@ -360,7 +426,7 @@ def test_frames_are_the_same_each_time(episode, terrain, planned):
 
 @pytest.mark.parametrize("count", [1, 5])
 def test_the_film_strip_holds_every_view(episode, terrain, planned, count):
-    strip = np.asarray(videos.film_strip(episode, terrain, planned.route, count=count))
+    strip = np.asarray(videos.film_strip(episode, terrain, planned.route, count=count).image)
     rows = -(-count // 2)
     assert strip.shape[0] == pytest.approx(rows * 181 + (rows - 1) * 6, abs=rows)
 

@@ -3,6 +3,7 @@
 import base64
 import io
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import nbformat
@@ -33,7 +34,8 @@ for _ in tqdm(range(3)):
     pass
 # %%
 from IPython.display import display
-display({"image/png": PNG, "text/plain": "a picture", "text/html": "<b>one</b>"}, raw=True)
+words = {"image/png": {"alt": "noise in many colours", "width": 4}}
+display({"image/png": PNG, "text/html": "<b>one</b>"}, metadata=words, raw=True)
 display({"application/vnd.jupyter.widget-view+json": {"model_id": "1"}}, raw=True)
 """
 
@@ -103,7 +105,7 @@ def test_a_lesson_has_short_cells_and_links_that_lead_somewhere(source):
 @pytest.mark.slow
 @LESSON
 def test_a_lesson_runs_from_top_to_bottom_in_fast_mode(source):
-    notebook = notebooks.build(source)
+    notebook = notebooks.build(source, fast=True)
     assert all(c.execution_count for c in notebook.cells if c.cell_type == "code")
 
 
@@ -111,7 +113,8 @@ def test_a_lesson_runs_from_top_to_bottom_in_fast_mode(source):
 
 
 @pytest.mark.slow
-def test_a_build_keeps_text_and_pictures_and_is_the_same_twice(tmp_path):
+def test_a_build_keeps_text_and_pictures_and_is_the_same_twice(tmp_path, monkeypatch):
+    monkeypatch.delenv("FGTUTOR_FAST", raising=False)
     source = write_lesson(tmp_path)
     config = NotebooksConfig(folder=tmp_path)
     assert notebooks.run(config) == 0
@@ -123,14 +126,17 @@ def test_a_build_keeps_text_and_pictures_and_is_the_same_twice(tmp_path):
         "01_lesson-02",
         "01_lesson-03",
     ]
-    assert text.outputs[0].text == "fast: 1\n"
+    assert text.outputs[0].text == "fast: 0\n"
     assert text.outputs[1].data == {"text/plain": "[]"}  # an empty folder of its own
     assert bar.outputs == []
     (picture,) = shown.outputs  # the widget has gone
     assert picture.data.keys() == {"image/png"}
+    assert picture.metadata == {"image/png": {"alt": "noise in many colours"}}
     assert find_drift(tmp_path) == {}
     assert notebooks.run(config) == 0 and built.read_bytes() == before
     assert source.exists()
+    assert notebooks.run(replace(config, fast=True)) == 0
+    assert find_drift(tmp_path) == {"01_lesson": "was executed in fast mode"}
 
 
 @pytest.mark.slow
@@ -158,11 +164,35 @@ def test_only_a_progress_bar_may_go_to_stderr(text, kept):
             list(notebooks._kept([output], "here"))
 
 
-def test_a_picture_is_shrunk_and_keeps_its_size():
-    small = notebooks.shrink(png(400))
-    assert len(small) < len(png(400)) / 2
-    with Image.open(io.BytesIO(base64.b64decode(small))) as image:
-        assert image.size == (400, 30)
+def shown(data: str, alt: str = "noise in many colours") -> nbformat.NotebookNode:
+    return new_output("display_data", {"image/png": data}, metadata={"image/png": {"alt": alt}})
+
+
+def colours_of(data: str) -> int:
+    with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+        return len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0))
+
+
+def test_pictures_keep_their_colours_while_there_is_room(monkeypatch):
+    notebook = notebook_with(shown(png(400)), shown(png(40)))
+    large, small = (output.data for output in notebook.cells[0].outputs)
+    before = colours_of(large["image/png"]), small["image/png"]
+    notebooks.slim(notebook)
+    assert (colours_of(large["image/png"]), small["image/png"]) == before
+    monkeypatch.setattr(notebooks, "LIMIT", len(nbformat.writes(notebook)) - 1)
+    notebooks.slim(notebook)  # now the largest gives way, and that is enough
+    assert 64 < colours_of(large["image/png"]) <= 256
+    assert small["image/png"] == before[1]
+    monkeypatch.setattr(notebooks, "LIMIT", 0)
+    notebooks.slim(notebook)
+    assert colours_of(large["image/png"]) <= 64
+
+
+def test_a_picture_keeps_its_size():
+    for colours in (None, 16):
+        data = notebooks.recode(png(400), colours)
+        with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+            assert image.size == (400, 30)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +205,9 @@ def test_a_picture_is_shrunk_and_keeps_its_size():
         (new_output("stream", name="stdout", text=r"in C:\Users\me"), r"absolute path C:\\U"),
         (new_output("display_data", {"text/html": "<b>x</b>"}), "holds text/html"),
         (new_output("error", ename="E", evalue="", traceback=[]), "holds an error"),
-        (new_output("display_data", {"image/png": "A" * notebooks.LIMIT}), "fewer or smaller"),
+        (shown("A" * notebooks.LIMIT), "fewer or smaller"),
+        (shown("A", alt="a figure"), "cell a-cell has a picture without alt text"),
+        (new_output("display_data", {"image/png": "A"}), "without alt text"),
     ],
 )
 def test_what_a_notebook_must_not_hold_is_named(output, fault):
@@ -209,7 +241,7 @@ def test_drift_is_found_and_says_where(tmp_path):
     assert find_drift(tmp_path) == {"01_lesson": "was never built"}
     built = tmp_path / "01_lesson.ipynb"
     notebook = read_source(source)
-    notebook.metadata["fgtutor"] = {"specialists": {}}
+    notebook.metadata["fgtutor"] = {"fast": False, "specialists": {}}
     nbformat.write(notebook, built)
     assert find_drift(tmp_path) == {}
     source.write_text(source.read_text().replace("range(3)", "range(4)"))

@@ -6,7 +6,9 @@ import torch
 
 from fgtutor.course.widgets.painting import Painting
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError
+from fgtutor.errors import ConfigError, OffMapError, PlanningError
+from fgtutor.routes import Route
+from fgtutor.specialist import load_zoo
 from fgtutor.tensorization import assess
 
 
@@ -81,3 +83,60 @@ def test_a_stroke_beyond_sense_is_refused(make_specialist, cells, height, radius
     with pytest.raises(ConfigError, match=r"no cell|needs a finite height"):
         painting.stroke(cells, height, radius)
     assert not painting.elevation.heights.any()
+
+
+def test_a_route_goes_round_what_is_painted():
+    """The shipped steps specialist of the toy, and a wall of 60 cm across its way."""
+    painting = Painting(ElevationMap(np.zeros((50, 40))), load_zoo("toy")["steps"],
+                        start=(0.65, 2.05), goal=(4.45, 2.05))  # fmt: skip
+    before = painting.answer
+    assert isinstance(before, Route) and before.length == pytest.approx(3.8)
+    painting.stroke([(25, y) for y in range(12, 29)], 0.6, 0.0)
+    after = painting.answer
+    assert isinstance(after, Route) and after.length > before.length + 0.3
+    crossing = after.xy[np.abs(after.xy[:, 0] - 2.55) < 0.06, 1]
+    assert ((crossing < 1.2) | (crossing > 2.9)).all()  # beside the wall, not over it
+    assert f"route: {after.length:.2f} m" in painting.status
+    painting.clear()
+    assert isinstance(painting.answer, Route)
+    assert painting.answer.length == pytest.approx(before.length)
+
+
+def test_a_painted_route_is_driven(make_rolling):
+    painting = Painting(ElevationMap(np.zeros((40, 20))), make_rolling("steps", f=0.9),
+                        taus=(50, 100), start=(0.65, 1.05), goal=(3.05, 1.05))  # fmt: skip
+    with pytest.raises(ConfigError, match="nothing was driven"):
+        painting.strip()
+    episode = painting.drive()
+    assert episode.success and "driven: reached" in painting.status
+    driven = painting.scene().lines[-1][1]
+    u, v = driven[0]
+    np.testing.assert_allclose(episode.poses[0, :2], (u * 0.1, 2.0 - v * 0.1), atol=1e-9)
+    assert painting.strip().alt.startswith("Film strip of 4 moments")
+    painting.stroke([(20, 10)], 0.1, 0.0)
+    assert painting.episode is None
+
+
+def test_a_painting_without_ends_or_without_a_way_says_so(make_rolling):
+    ground = ElevationMap(np.zeros((12, 10)))
+    with pytest.raises(ConfigError, match="give both of them, or neither"):
+        Painting(ground, make_rolling(), start=(0.5, 0.5))
+    with pytest.raises(OffMapError):
+        Painting(ground, make_rolling(), start=(0.5, 0.5), goal=(9.0, 0.5))
+    with pytest.raises(ConfigError, match="needs a route"):
+        Painting(ground, make_rolling()).drive()
+    closed = Painting(
+        ground, make_rolling(f=0.05), taus=(50, 100), start=(0.5, 0.5), goal=(0.9, 0.5)
+    )
+    assert "no route: " in closed.status
+    with pytest.raises(PlanningError):
+        closed.drive()
+
+
+def test_a_small_map_is_called_small(make_specialist):
+    painting = Painting(ElevationMap(np.zeros((8, 6))), make_specialist())
+    painting.stroke([(4, 3)], 0.3, 0.0)
+    assert painting.status.endswith("(this map is hardly larger than what a patch sees)")
+    painting = Painting(ElevationMap(np.zeros((40, 30))), make_specialist())
+    painting.stroke([(4, 3)], 0.3, 0.0)
+    assert "hardly larger" not in painting.status

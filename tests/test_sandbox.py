@@ -65,6 +65,58 @@ def test_the_code_of_the_current_folder_does_not_run(tmp_path, monkeypatch):
     assert asked([cell], f=(2,))["f"]["answers"] == [3]
 
 
+@pytest.mark.slow
+def test_torch_can_be_used_and_the_walls_stand():
+    cells = [
+        "import torch\nfrom torch import nn",
+        "def f(x):\n"
+        "    net = nn.Linear(2, 1)\n    optimizer = torch.optim.SGD(net.parameters(), 0.1)\n"
+        "    for _ in range(20):\n        loss = (net(x) - 1).square().mean()\n"
+        "        optimizer.zero_grad(); loss.backward(); optimizer.step()\n"
+        "    return loss < 0.5, torch.get_num_threads()",
+        "def g(k):\n    import os, ctypes\n    failed = []\n"
+        "    for act in (os.fork, lambda: open('/etc/passwd'),\n"
+        "                lambda: ctypes.CDLL(None),\n"
+        "                lambda: __import__('socket').socket(), lambda: os.kill(os.getppid(), 9),\n"
+        "                lambda: torch.load('/etc/passwd'), lambda: torch.save(k, '/tmp/x.pt')):\n"
+        "        try: act()\n        except (OSError, RuntimeError): failed.append(1)\n"
+        "    return len(failed)",
+    ]
+    import torch
+
+    case = [encode((torch.ones(3, 2),), tensors=True)]
+    questions = [
+        {"id": "f", "name": "f", "cases": case},
+        {"id": "g", "name": "g", "cases": [encode((1,))]},
+        {"id": "h", "name": "f", "cases": case, "harness": ["h", HARNESS]},
+    ]
+    replies, in_force = ask_submission(cells, questions, Limits(seconds=2, loading=1))
+    assert {"memory limited", *(WALLS if landlock_version() else ())} <= {*in_force}
+    assert replies["f"]["answers"][0]["tuple"][1] == 1, replies
+    assert replies["g"]["answers"] == [7], replies
+    assert replies["h"]["answers"] == [True], replies
+
+
+HARNESS = "def h(target, x):\n    import torch\n    return bool(target(x)[0]) or True\n"
+
+
+@pytest.mark.parametrize(
+    ("cell", "needed"),
+    [
+        ("import torch", True),
+        ("    from torch import nn", True),
+        ("import numpy as np, torch as t", True),
+        ("import torch.nn.functional as F", True),
+        ("import numpy  # not torch's", True),
+        ("torch = 3", False),
+        ("import torchvision", False),
+        ("import numpy", False),
+    ],
+)
+def test_torch_is_loaded_only_for_those_who_use_it(cell, needed):
+    assert sandbox.needs_torch([cell], []) == needed
+
+
 # What counts against it ---------------------------------------------------------------------------
 
 

@@ -178,9 +178,9 @@ def test_what_is_no_notebook_is_named_with_the_reason(tmp_path):
         "._ex06_ada.ipynb": "macOS's data on another file",
         ".ipynb_checkpoints": "Jupyter's own copies",
         "ex06_bob.zip": "an archive: unpack it first",
-        "ex06_eve.pdf": "no notebook (.ipynb)",
+        "ex06_eve.pdf": "no notebook (.ipynb) and no mine.py",
         ".git": "a hidden folder",
-        "deep/er/notes.txt": "no notebook (.ipynb)",
+        "deep/er/notes.txt": "no notebook (.ipynb) and no mine.py",
         "link": "a link, which is not followed: the file itself must be handed in",
     }
 

@@ -1,5 +1,6 @@
 """The widgets in Python: what a browser would send, and what it would get."""
 
+import base64
 import io
 import subprocess
 import sys
@@ -50,6 +51,14 @@ def widgets():
     return jupyter
 
 
+def shown(widget) -> tuple[Image.Image, str]:
+    """The picture that a page without a kernel shows, and its words."""
+    data, words = widget._repr_mimebundle_()
+    assert "application/vnd.jupyter.widget-view+json" in data
+    picture = Image.open(io.BytesIO(base64.b64decode(data["image/png"])))
+    return picture, words["image/png"]["alt"]
+
+
 def say(board, **content) -> None:
     """What the canvas sends when a person does something."""
     board.view._handle_custom_msg(content, [])
@@ -84,6 +93,32 @@ def test_a_button_chooses_ours_or_the_papers(widgets, grid, said, name, settings
     assert board.switch_cost.value == settings.switch_cost
 
 
+def test_the_calibrated_thresholds_are_one_press_away(widgets, grid, said):
+    """The slider holds one pair for all; while each policy has its own, it says nothing."""
+    board = widgets.TauExplorer(grid, said, START, GOAL)
+    assert board.rule.value == "calibrated" and board.explorer.settings.taus == "calibrated"
+    board.taus.value = (0.2, 0.7)
+    assert board.rule.value == "one pair" and board.explorer.settings.taus == (0.2, 0.7)
+    board.rule.value = "calibrated"
+    assert board.view.status == Explorer(grid, said, START, GOAL).status
+    board.rule.value = "one pair"
+    assert board.explorer.settings.taus == (0.2, 0.7)
+
+
+def test_every_widget_brings_a_picture_of_itself(
+    widgets, grid, said, make_specialist, make_rolling
+):
+    ground = ElevationMap(np.zeros((20, 16)))
+    for widget, words in (
+        (widgets.TauExplorer(grid, said, START, GOAL), "w_ood of gaps"),
+        (widgets.TerrainPainter(ground, make_specialist()), "Elevation map M: paint here"),
+        (widgets.DriveA1(make_terrain("flat", robot="toy"), {"steps": make_rolling()}), "steps at"),
+    ):
+        picture, alt = shown(widget)
+        assert picture.width >= 700 and words in alt
+        assert np.asarray(picture.convert("L")).std() > 5
+
+
 def test_clicks_arrows_and_hovering_reach_the_explorer(widgets, grid, said):
     board = widgets.TauExplorer(grid, said, START, GOAL)
     say(board, kind="press", cells=[[2, 5]], shift=False)
@@ -116,16 +151,47 @@ def test_a_painter_paints_what_is_dragged_over(widgets, make_specialist):
     assert board.view.pictures["M"] != before["M"] and board.view.overlay["box"] is not None
     say(board, kind="hover", cells=[[5, 5]])
     assert "height 0.30 m" in board.view.reading
+    assert board.heading.label == "best"  # not an empty field
     board.heading.value = 0
     assert board.view.rows[0][1]["title"].endswith("+x")
     board.clear.click()
     assert board.view.pictures["M"] == before["M"]
 
 
+def test_a_painter_paints_by_keyboard(widgets, make_specialist):
+    board = widgets.TerrainPainter(ElevationMap(np.zeros((20, 16))), make_specialist())
+    board.height.value, board.radius.value = 0.3, 0.0
+    say(board, kind="move", step=[-2, 1], shift=False)
+    assert board.view.overlay["marks"]["brush"] == (8.5, 16 - 9 - 0.5)
+    say(board, kind="enter")
+    assert np.argwhere(board.painting.elevation.heights).tolist() == [[8, 9]]
+    say(board, kind="move", step=[-99, 99], shift=False)
+    say(board, kind="enter")
+    assert board.painting.elevation.heights[0, 15] == np.float32(0.3)
+
+
+def test_a_painter_plans_and_drives(widgets, make_rolling):
+    ground, ends = ElevationMap(np.zeros((40, 20))), {"start": (0.65, 1.05), "goal": (3.05, 1.05)}
+    specialist = make_rolling("steps", f=0.9)
+    board = widgets.TerrainPainter(ground, specialist, taus=(50.0, 100.0), **ends)
+    assert len(board.view.overlay["lines"]) == 1 and "route: 2.40 m" in board.view.status
+    assert not board.drive.disabled and board.film.layout.display == "none"
+    board.drive.click()
+    assert "driven: reached" in board.view.status
+    assert len(board.view.overlay["lines"]) == 2 and board.film.layout.display == ""
+    assert Image.open(io.BytesIO(board.film.value)).width > 700
+    say(board, kind="press", cells=[[20, 10]], shift=False)
+    assert "driven" not in board.view.status and board.film.layout.display == "none"
+    assert widgets.TerrainPainter(ElevationMap(np.zeros((9, 9))), make_rolling()).drive.disabled
+
+
 def test_a_drive_plays_pauses_and_resets(widgets, make_rolling):
     board = widgets.DriveA1(make_terrain("flat", robot="toy"), {"steps": make_rolling()})
     first = board.image.value
     assert Image.open(io.BytesIO(first)).size == (720, 272)
+    assert board.image.layout.align_self == "flex-start"  # not stretched to the page
+    board.speed.value = -0.4
+    assert board.drive.speed == -0.4
     board.speed.value = 0.5
     board.play.value = 1
     board.play.value = 2
@@ -145,7 +211,9 @@ def test_without_the_lab_extra_the_message_says_how_to_install_it():
 
 
 def test_the_front_end_is_shipped_and_asks_no_network(widgets):
+    from fgtutor.course.widgets.board import STATIC, Canvas
+
     for name in ("panels.js", "panels.css"):
-        text = (widgets.STATIC / name).read_text(encoding="utf-8")
+        text = (STATIC / name).read_text(encoding="utf-8")
         assert "://" not in text and "import " not in text
-    assert "export default" in widgets.Canvas._esm
+    assert "export default" in Canvas._esm

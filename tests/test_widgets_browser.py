@@ -53,6 +53,7 @@ CELLS = (
     WORLD,
     "from fgtutor.course.widgets.jupyter import TauExplorer\n"
     "TauExplorer(M, said, start, goal, taus=(0.1, 2.0), switch_cost=1.0)",
+    "from fgtutor.course.widgets.slides import TrackingSlides\nTrackingSlides()",
 )
 
 
@@ -351,6 +352,17 @@ def test_the_tau_slider_by_keyboard_and_the_goal_by_click(
     assert status() == explorer.status
 
     page.screenshot(tmp_path / "after.png")
+
+    # A slide of matplotlib's pictures follows the arrow keys too, and says what came out.
+    slides = "[...document.querySelectorAll('.jp-Cell')].at(-1)"
+    page.wait(f"{slides}.querySelector('img')?.naturalWidth === 760", "the slide to be drawn")
+    page.evaluate(f"{slides}.scrollIntoView({{block: 'end'}})")
+    said = "[...document.querySelectorAll('.jp-Cell')].at(-1).querySelector('.jp-OutputArea')"
+    assert "sigma 0.25 m/s" in page.evaluate(f"{said}.textContent")
+    page.evaluate(f"{slides}.querySelector('[role=slider]').focus()")
+    page.press("ArrowRight", 39)
+    page.wait(f"{said}.textContent.includes('sigma 0.30 m/s')", "the slide to follow")
+    page.screenshot(tmp_path / "slides.png")
     assert page.errors == []
     record_property("key_press_to_paint_ms_p95", round(p95(waits), 1))
     with capsys.disabled():

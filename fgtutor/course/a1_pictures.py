@@ -8,19 +8,21 @@ notebook runs everywhere.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
+from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from fgtutor.errors import ConfigError, RenderingError
 from fgtutor.execution import Episode, FollowConfig
 from fgtutor.figures.a1_film import BESIDE, DISTANCE, VIEW
-from fgtutor.figures.style import INK, LINES, TITLE, Panels, Picture, colours_of
+from fgtutor.figures.style import INK, LINES, TITLE, Panels, Photo, Picture, colours_of
 from fgtutor.figures.videos import film_strip
 from fgtutor.io.validation import Positive, check_arguments
 from fgtutor.robots.a1.looks import a1_scene
@@ -32,6 +34,8 @@ from fgtutor.world.terrain import Terrain
 
 LEG_COLOURS = dict(zip(LEGS, LINES, strict=False))
 """Each leg has one colour in the stick figures and in the gait."""
+EARTH = "#B08D5E"
+"""The colour of the ground below them."""
 LOADED = 10.0
 """A foot that the ground pushes with more than this stands, N."""
 STEEPNESS = 25.0
@@ -65,8 +69,14 @@ def leg_points(qpos: ArrayLike) -> Float[np.ndarray, "4 4 3"]:
     return legs
 
 
-def draw_postures(postures: Mapping[str, ArrayLike], *, title: str = "") -> Picture:
-    """Draw states of the A1 as stick figures: from its right side above, from the front below."""
+def draw_postures(
+    postures: Mapping[str, ArrayLike], *, title: str = "", plane: bool = False
+) -> Picture:
+    """Draw states of the A1 as stick figures: from its right side above, from the front below.
+
+    Nearer legs hide farther ones, which are paler. With `plane`, a line shows the plane through the
+    four feet, which is the ground if all of them stand.
+    """
     columns = max(1, len(postures))
     width = min(2.6 * columns, 7.6)
     figure = Picture(max(width, 3.0), 2 * 0.6 * width / columns + 1.0)
@@ -76,34 +86,56 @@ def draw_postures(postures: Mapping[str, ArrayLike], *, title: str = "") -> Pict
         yaw = Rotation.from_quat(state[3:7], scalar_first=True).as_euler("ZYX")[0]
         ahead = Rotation.from_euler("z", -yaw)
         legs = ahead.apply((leg_points(state) - state[:3]).reshape(-1, 3)).reshape(4, 4, 3)
-        # Seen from the front, the robot's left, +y, is on the right.
-        for row, axis in enumerate((0, 1)):
+        # From its right, at -y, one looks along +y; from the front along -x, its left at the right.
+        for row, (across, depth) in enumerate(((0, legs[:, 0, 1]), (1, -legs[:, 0, 0]))):
             axes = panels[row, column]
-            _draw_legs(axes, legs[..., axis], legs[..., 2])
-            axes.set(xlim=(-0.42, 0.42), ylim=(-0.38, 0.12), aspect="equal")
-            axes.set(xticks=(), yticks=())
+            axes.set(xlim=(-0.42, 0.42), ylim=(-0.42, 0.12), aspect="equal", xticks=(), yticks=())
+            if plane:
+                _draw_plane(axes, legs[:, 3], across)
+            _draw_legs(axes, legs[..., across], legs[..., 2], depth)
         panels[0, column].set_title(name, fontsize=9, loc="left")
     panels[0, 0].set_ylabel("from its right", fontsize=9)
     panels[1, 0].set_ylabel("from the front", fontsize=9)
-    for leg, colour in LEG_COLOURS.items():
-        panels[0, 0].plot([], [], color=colour, label=leg)
-    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    handles = [Line2D([], [], color=colour, label=leg) for leg, colour in LEG_COLOURS.items()]
+    style = {"ncols": 5, "frameon": False, "fontsize": 9}
+    if plane:
+        handles.append(Line2D([], [], color=EARTH, linewidth=4, label="plane of the feet"))
+    figure.legend(handles=handles, loc="outside lower center", **style)
     figure.suptitle(title, **TITLE, x=0.01)
     return figure
 
 
-def _draw_legs(axes, across: Float[np.ndarray, "4 4"], up: Float[np.ndarray, "4 4"]) -> None:
-    """Draw trunk and legs as lines in one plane."""
+def _draw_legs(
+    axes: Axes,
+    across: Float[np.ndarray, "4 4"],
+    up: Float[np.ndarray, "4 4"],
+    depth: Float[np.ndarray, " legs"],
+) -> None:
+    """Draw trunk and legs as lines in one plane, from the farthest to the nearest."""
     hull = [0, 1, 3, 2, 0]  # around the trunk: FR, FL, RL, RR
-    axes.plot(across[hull, 0], up[hull, 0], color=INK, linewidth=4, solid_joinstyle="round")
-    for leg, colour in enumerate(LEG_COLOURS.values()):
-        axes.plot(across[leg], up[leg], ".-", color=colour, linewidth=2.5)
-        axes.plot(across[leg, -1], up[leg, -1], "o", color=INK, markersize=5)
+    axes.plot(
+        across[hull, 0], up[hull, 0], color=INK, linewidth=4, solid_joinstyle="round", zorder=3
+    )
+    colours = list(LEG_COLOURS.values())
+    for leg, colour in enumerate(colours):
+        far = depth[leg] > depth.mean()
+        style: dict[str, Any] = {"zorder": 2, "alpha": 0.45} if far else {"zorder": 4}
+        axes.plot(across[leg], up[leg], ".-", color=colour, linewidth=2.5, **style)
+        axes.plot(across[leg, -1], up[leg, -1], "o", color=INK, markersize=5, **style)
+
+
+def _draw_plane(axes: Axes, feet: Float[np.ndarray, "4 3"], across: int) -> None:
+    """Draw where the plane through the feet (least squares) cuts the middle of the robot."""
+    ground = np.column_stack((feet[:, :2], np.ones(4)))
+    slopes = np.linalg.lstsq(ground, feet[:, 2], rcond=None)[0]
+    ends = np.array((-0.42, 0.42))
+    up = slopes[2] + slopes[across] * ends
+    axes.plot(ends, up - 0.02, color=EARTH, linewidth=4, zorder=1)
 
 
 def show_walk(
     episode: Episode, terrain: Terrain, route: Route, *, count: Panels = 6, columns: Panels = 3
-) -> Image.Image | Picture:
+) -> Photo | Picture:
     """Return a film strip of a walk; where nothing draws MuJoCo's scenes, stick figures of it."""
     check_arguments(show_walk, locals(), ConfigError)
     try:
@@ -111,7 +143,7 @@ def show_walk(
     except RenderingError:
         print("no graphics library draws here (`fgtutor doctor` says why): stick figures instead")
         return walk_sticks(episode, count=min(count, 4))
-    strip.thumbnail((PAGE, strip.height))
+    strip.image.thumbnail((PAGE, strip.image.height))
     return strip
 
 
@@ -152,11 +184,9 @@ class A1View:
     def _draw(self, qpos: np.ndarray, yaw: float) -> UInt8[np.ndarray, "height width 3"]:
         if self._renderer is None:
             width, height = VIEW
-            ends = np.array((self.terrain.start, self.terrain.goal))
+            goal = np.array([self.terrain.goal])  # a disc, and no line: nothing was planned
             radius = FollowConfig().goal_radius
-            scene = a1_scene(
-                self.terrain, ends, [self.coat], width=width, height=height, goal_radius=radius
-            )
+            scene = a1_scene(self.terrain, goal, [], width=width, height=height, goal_radius=radius)
             self._renderer = Renderer(scene, width, height)
         x, y, z = qpos[:3].tolist()
         shot = Shot(

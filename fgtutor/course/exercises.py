@@ -102,7 +102,7 @@ def _blank(region: re.Match[str]) -> str:
 def _defined(tree: ast.Module) -> Iterator[str]:
     """Yield the names that a cell defines."""
     for node in tree.body:
-        if isinstance(node, ast.FunctionDef):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name
         elif isinstance(node, ast.Assign):
             yield from (target.id for target in node.targets if isinstance(target, ast.Name))

@@ -1,8 +1,9 @@
 """The course's notebooks: how long their cells work, and how a source becomes a notebook.
 
 Reads notebooks/src/NN_name.py (jupytext percent format, one way); gives notebooks/NN_name.ipynb,
-executed in fast mode by a real kernel, its outputs reduced to text and small PNG pictures, so that
-a page without a kernel teaches too and a rebuild changes as little as it can.
+executed by a real kernel, its outputs reduced to text and PNG pictures with alt text, so that a
+page without a kernel teaches too and a rebuild changes as little as it can. What is committed is
+executed in full: its numbers and pictures are those that the text speaks of.
 """
 
 from __future__ import annotations
@@ -34,10 +35,12 @@ if TYPE_CHECKING:
 
 FAST = "FGTUTOR_FAST"
 """Environment variable: 1 makes every `budget` its fast one."""
-LIMIT = 500_000
+LIMIT = 600_000
 """Largest notebook, outputs included, bytes."""
-COLOURS = 256
-"""A PNG is reduced to a palette of this many colours: a third of the size, and no eye can tell."""
+COLOURS = (256, 64)
+"""Colours of a picture that has to be small, and of one that has to be smaller still."""
+ALT_WORDS = 3
+"""Fewest words that can say what a picture shows."""
 PATH = re.compile(r"(?<![\w./:<-])(?:/[\w.+-]+){2,}|\b[A-Za-z]:\\\w")
 """An absolute path, of any system: it would tell where the notebook was built."""
 BAR = re.compile(r".*\d+/\d+ \[.*\]")
@@ -88,12 +91,12 @@ def read_source(source: Path) -> NotebookNode:
     return notebook
 
 
-def build(source: Path, *, timeout: int = 900) -> NotebookNode:
-    """Execute a source in fast mode, in an empty folder, and keep what a reader should see.
+def build(source: Path, *, fast: bool = False, timeout: int = 900) -> NotebookNode:
+    """Execute a source in an empty folder, in full or in fast mode; keep what readers should see.
 
     Raises:
         NotebookError: A cell fails, takes longer than `timeout` seconds or writes a warning, or the
-            notebook shows an absolute path or is larger than `LIMIT`.
+            notebook has a fault (`find_faults`).
     """
     from nbclient import NotebookClient
     from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
@@ -114,7 +117,7 @@ def build(source: Path, *, timeout: int = 900) -> NotebookNode:
         )
         try:
             # The reader's own IPython start-up files are no part of the course.
-            client.execute(env=os.environ | {FAST: "1", "IPYTHONDIR": settings})
+            client.execute(env=os.environ | {FAST: str(int(fast)), "IPYTHONDIR": settings})
         except (CellExecutionError, CellTimeoutError, DeadKernelError) as error:
             raise NotebookError(f"{source.name} does not run: {error}") from error
     for cell in notebook.cells:
@@ -123,7 +126,8 @@ def build(source: Path, *, timeout: int = 900) -> NotebookNode:
             cell.outputs = list(_kept(cell.outputs, f"{source.name}, cell {cell.id}"))
     notebook.metadata.pop("widgets", None)
     notebook.metadata["language_info"] = {"name": "python"}  # the kernel adds its version
-    notebook.metadata["fgtutor"] = {"specialists": specialists_of(notebook)}
+    notebook.metadata["fgtutor"] = {"fast": fast, "specialists": specialists_of(notebook)}
+    slim(notebook)
     faults = find_faults(notebook)
     if faults:
         raise NotebookError(f"{source.name}: {'; '.join(faults)}")
@@ -131,7 +135,7 @@ def build(source: Path, *, timeout: int = 900) -> NotebookNode:
 
 
 def _kept(outputs: Sequence[Any], where: str) -> Iterator[Any]:
-    """Yield the outputs worth keeping: text, and pictures as small PNGs.
+    """Yield the outputs worth keeping: text, and pictures as PNGs with their alt text.
 
     A widget lives only with its kernel and goes, unless it brings a picture of itself; so does a
     progress bar. Raises `NotebookError` for any other line on stderr: a lesson has no warnings.
@@ -146,21 +150,40 @@ def _kept(outputs: Sequence[Any], where: str) -> Iterator[Any]:
             continue
         data = output.data
         if "image/png" in data:
-            output.data = {"image/png": shrink(data["image/png"])}
-        elif WIDGET in data or "text/plain" not in data:
+            words = output.metadata.get("image/png", {}).get("alt")
+            output.data = {"image/png": recode(data["image/png"])}
+            output.metadata = {"image/png": {"alt": words}} if words else {}
+            yield output
             continue
-        else:
-            output.data = {"text/plain": data["text/plain"]}
-        output.metadata = {}
-        yield output
+        if WIDGET not in data and "text/plain" in data:
+            output.data, output.metadata = {"text/plain": data["text/plain"]}, {}
+            yield output
 
 
-def shrink(png: str) -> str:
-    """Return a base64 PNG reduced to `COLOURS` colours, or as it was if that is smaller."""
+def slim(notebook: NotebookNode) -> None:
+    """Reduce the largest pictures to `COLOURS`, until the notebook is within `LIMIT`.
+
+    A palette can turn a smooth colour bar into bands; as many pictures as fit keep every colour.
+    """
+    import nbformat
+
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    pictures = [output.data for output in outputs if "image/png" in output.get("data", {})]
+    for colours in COLOURS:
+        for data in sorted(pictures, key=lambda data: len(data["image/png"]), reverse=True):
+            if len(nbformat.writes(notebook).encode()) <= LIMIT:
+                return
+            data["image/png"] = recode(data["image/png"], colours)
+
+
+def recode(png: str, colours: int | None = None) -> str:
+    """Return a base64 PNG without transparency, as small as it gets, in so many colours at most."""
     with Image.open(io.BytesIO(base64.b64decode(png))) as image:
-        small = image.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+        picture = image.convert("RGB")
+    if colours is not None:
+        picture = picture.quantize(colours, kmeans=2, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
-    small.save(buffer, format="PNG", optimize=True)
+    picture.save(buffer, format="PNG", optimize=True)
     return min(png.replace("\n", ""), base64.b64encode(buffer.getvalue()).decode(), key=len)
 
 
@@ -168,7 +191,10 @@ def shrink(png: str) -> str:
 
 
 def find_faults(notebook: NotebookNode) -> list[str]:
-    """Say what a built notebook must not hold: much data, absolute paths, widgets, other media."""
+    """Say what a built notebook must not hold: much data, absolute paths, widgets, other media.
+
+    Nor may it hold a picture without alt text.
+    """
     import nbformat
 
     faults = []
@@ -185,6 +211,12 @@ def find_faults(notebook: NotebookNode) -> list[str]:
             if others or output.output_type == "error":
                 faults.append(f"cell {cell.id} holds {', '.join(sorted(others)) or 'an error'}")
             texts += [output.get("text", ""), data.get("text/plain", "")]
+            alt = output.get("metadata", {}).get("image/png", {}).get("alt", "")
+            if "image/png" in data and len(alt.split()) < ALT_WORDS:
+                faults.append(
+                    f"cell {cell.id} has a picture without alt text: show a Picture or a Photo, "
+                    "which bring it"
+                )
         paths = [match[0] for text in texts for match in PATH.finditer(text)]
         if paths:
             faults.append(f"cell {cell.id} shows the absolute path {paths[0]}")
@@ -195,7 +227,8 @@ def find_drift(folder: Path) -> dict[str, str]:
     """Return by name every notebook of a course that is not what its source gives, and why.
 
     Sources lie in `folder`/src. A notebook is also stale once the shipped specialists of a robot
-    that it names have changed since it was executed: its numbers and pictures are theirs.
+    that it names have changed since it was executed: its numbers and pictures are theirs. And one
+    that was executed in fast mode does not show what its text says.
     """
     import nbformat
 
@@ -214,6 +247,8 @@ def find_drift(folder: Path) -> dict[str, str]:
             drift[name] = f"differs from its source from cell {[*same, False].index(False)} on"
         elif notebook.metadata.get("fgtutor", {}).get("specialists") != specialists_of(fresh):
             drift[name] = "was executed with other specialists than those shipped"
+        elif notebook.metadata["fgtutor"].get("fast", True):
+            drift[name] = "was executed in fast mode"
     return drift
 
 
@@ -233,7 +268,7 @@ def _zoo_checksum(robot: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class NotebooksConfig:
-    """Execute the course's notebooks in fast mode and write them with their pictures."""
+    """Execute the course's notebooks in full and write them with their pictures."""
 
     names: tuple[str, ...] = ()
     """Beginnings of names, such as 01 06; default: all."""
@@ -243,6 +278,9 @@ class NotebooksConfig:
     """Where to write; default: the folder itself."""
     timeout: Annotated[int, Interval(ge=1, le=86_400)] = 900
     """Longest time for one cell, s."""
+    fast: bool = False
+    """Execute in fast mode, in a minute or two each, to see that they run; FGTUTOR_FAST=1 does the
+    same. Not for what is committed."""
     check: bool = False
     """Execute nothing; say which notebooks are not what their sources give, and fail if any."""
 
@@ -269,10 +307,11 @@ def run(config: NotebooksConfig) -> int:
         )
     out = config.out or config.folder
     make_folder(out)
+    fast = config.fast or os.environ.get(FAST) == "1"
     for source in sources:
         began = time.monotonic()
         with waiting(f"executing {source.name}"):
-            text = nbformat.writes(build(source, timeout=config.timeout)) + "\n"
+            text = nbformat.writes(build(source, fast=fast, timeout=config.timeout)) + "\n"
         with atomic_write(out / f"{source.stem}.ipynb") as path:
             path.write_text(text, encoding="utf-8")
         seconds = time.monotonic() - began

@@ -6,7 +6,8 @@ for whole maps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,11 +23,14 @@ from fgtutor import patches
 from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.figures.maps import GROUND, draw_elevation
-from fgtutor.figures.style import INK, TITLE, Panels, Picture
+from fgtutor.figures.maps import draw_elevation
+from fgtutor.figures.relief import GROUND
+from fgtutor.figures.style import F_COLOURS, INK, TITLE, Panels, Picture
 from fgtutor.io.validation import check_arguments
 from fgtutor.patches import PatchGrid, sample_patches
 
+F_SCALE: dict[str, Any] = {"vmin": 0.0, "vmax": 1.0, "cmap": F_COLOURS}
+"""How numbers from 0 to 1 are coloured."""
 SMALL = {"fontsize": 8.5, "loc": "left"}
 """Titles of small panels."""
 
@@ -45,12 +49,11 @@ def patch_at(elevation: ElevationMap, pose: ArrayLike, grid: PatchGrid) -> Float
 
 def draw_windows(elevation: ElevationMap, poses: ArrayLike, grid: PatchGrid) -> Picture:
     """Draw on the map where the patches at some poses (x, y, yaw) lie, and where each one looks."""
-    figure = draw_elevation(elevation)
-    axes = figure.axes[0]
+    title = "The windows that patches are cut from"
+    caption = "Outline: the window of a patch. Its arrow points ahead"
+    figure = draw_elevation(elevation, title=title, caption=caption)
     for pose in np.atleast_2d(np.asarray(poses, dtype=float)):
-        _window(axes, pose, grid)
-    axes.set_title("The windows that patches are cut from", **TITLE, loc="left")
-    axes.set_xlabel("x (m)\nThe arrow points ahead", fontsize=9)
+        _window(figure.axes[0], pose, grid)
     return figure  # pyright: ignore[reportReturnType]
 
 
@@ -126,13 +129,35 @@ def heading_maps(tensor: ArrayLike, grid: ElevationMap, *, label: str = "F") -> 
         figure.subplots(*[headings.count // 4 + 1] * 2, sharex=True, sharey=True),
         # An image is [row = y, column = x]: transpose, with its first row at the bottom.
         lambda axes, heading: axes.imshow(
-            values[..., heading].T, origin="lower", extent=(x0, x1, y0, y1), vmin=0, vmax=1
+            values[..., heading].T, origin="lower", extent=(x0, x1, y0, y1), **F_SCALE
         ),
         grid,
         headings,
         label=label,
     )
     figure.suptitle(f"{label}: one map per heading", **TITLE, x=0.01)
+    return figure
+
+
+def feasibility_maps(
+    tensors: Mapping[str, ArrayLike], grid: ElevationMap, *, label: str = "F, mean of the headings"
+) -> Picture:
+    """Draw tensors [nx, ny, d] of one map side by side, each as its mean over the headings."""
+    width, height = 6.6 / max(len(tensors), 1), grid.size[1] / grid.size[0]
+    figure = Picture(7.6, float(np.clip(width * height, 1.2, 7.0)) + 0.9)
+    panels = figure.subplots(1, len(tensors), sharex=True, sharey=True, squeeze=False)[0]
+    x0, y0, x1, y1 = grid.extent
+    image = None
+    for axes, (name, tensor) in zip(panels, tensors.items(), strict=True):
+        mean = np.asarray(tensor).mean(axis=-1)
+        # An image is [row = y, column = x]: transpose, with its first row at the bottom.
+        image = axes.imshow(mean.T, origin="lower", extent=(x0, x1, y0, y1), **F_SCALE)
+        axes.set_title(name, **TITLE, loc="left")
+        axes.set_xlabel("x (m)", fontsize=9)
+        axes.tick_params(labelsize=8)
+    panels[0].set_ylabel("y (m)", fontsize=9)
+    if image is not None:
+        figure.colorbar(image, ax=list(panels), shrink=0.9, pad=0.01, label=label)
     return figure
 
 

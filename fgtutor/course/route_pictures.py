@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING
 
 import networkx
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.figures.maps import draw_elevation, draw_route
+from fgtutor.figures.panels import legend
 from fgtutor.figures.style import INK, TITLE, Panels, Picture, policy_colours
 from fgtutor.io.validation import check_arguments
 from fgtutor.routes import Refusal, Route
@@ -42,7 +40,8 @@ def draw_graph(
 
     The arrows of `path` carry their costs; `names` are the policies, which give the colours.
     """
-    figure = draw_elevation(grid)
+    title = "The graph: one node per cell, one arrow per step"
+    figure = draw_elevation(grid, title=title, caption="The fuller an arrow, the cheaper")
     axes = figure.axes[0]
     edges = list(graph.edges(data=True))
     tails = np.array([grid.centre_of(*tail) for tail, _, _ in edges])
@@ -70,10 +69,7 @@ def draw_graph(
         box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": INK}
         x, y = (a + b) / 2
         axes.text(x, y, f"{weight:.2f}", ha="center", va="center", fontsize=8, bbox=box)
-    _legend(figure, colours)
-    _say(
-        axes, "The graph: one node per cell, one arrow per step", "The fuller an arrow, the cheaper"
-    )
+    legend(axes, colours)
     return figure  # pyright: ignore[reportReturnType]
 
 
@@ -103,13 +99,17 @@ def compare_routes(
         axes.set(xticks=(), yticks=())
     for axes in panels[len(routes) :]:
         axes.remove()
-    _legend(figure, used)
+    legend(panels[0], used)
     return figure
 
 
 def draw_drive(episode: Episode, route: Route, elevation: ElevationMap) -> Picture:
     """Draw the driven way, coloured by the active policy, over the planned route in white."""
-    figure = draw_elevation(elevation)
+    caption = "White: the route. Colour: the policy that drove. "
+    caption += f"{episode.length:.1f} m in {episode.seconds:.0f} s, "
+    caption += f"policy switches: {episode.switches}"
+    title = f"Driven ({episode.reason}) over planned"
+    figure = draw_elevation(elevation, title=title, caption=caption)
     axes = figure.axes[0]
     axes.plot(*route.xy.T, color="white", linewidth=7, alpha=0.9, solid_capstyle="round")
     xy = episode.poses[:, :2]
@@ -122,25 +122,5 @@ def draw_drive(episode: Episode, route: Route, elevation: ElevationMap) -> Pictu
         )
     )
     axes.plot(*xy[-1], "o" if episode.success else "X", color=INK, markersize=10)
-    _legend(figure, {route.names[i]: colours[i] for i in np.unique(episode.policies).tolist()})
-    _say(
-        axes,
-        f"Driven ({episode.reason}) over planned",
-        f"White: the route. Colour: the policy that drove. {episode.length:.1f} m in "
-        f"{episode.seconds:.0f} s, policy switches: {episode.switches}",
-    )
+    legend(axes, {route.names[i]: colours[i] for i in np.unique(episode.policies).tolist()})
     return figure  # pyright: ignore[reportReturnType]
-
-
-def _legend(figure: Figure, colours: Mapping[str, str]) -> None:
-    """Name the colours of lines below the picture."""
-    lines = [Line2D([], [], color=colour, lw=3, label=name) for name, colour in colours.items()]
-    figure.legend(
-        handles=lines, loc="outside lower center", ncols=len(lines), frameon=False, fontsize=9
-    )
-
-
-def _say(axes: Axes, title: str, caption: str) -> None:
-    """Write what is drawn above the map, and what to see in it below."""
-    axes.set_title(title, **TITLE, loc="left")
-    axes.set_xlabel(f"x (m)\n{caption}", fontsize=9)

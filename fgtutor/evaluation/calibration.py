@@ -119,9 +119,9 @@ def drive(specialist: Specialist, terrain: str, config: CalibrationConfig) -> Ro
 
 
 def terrains(kind: str, config: CalibrationConfig) -> list[Terrain]:
-    """Return held-out terrains of one kind and full difficulty."""
+    """Return terrains of one kind and full difficulty, whose maps equal none of a training."""
     return [
-        make_terrain(kind, robot=config.robot, seed=2 * (config.seed * 10_000 + i) + 1)
+        make_terrain(kind, robot=config.robot, seed=2 * (config.seed * 10_000 + i) + 1, unlike=True)
         for i in range(config.envs)
     ]
 
@@ -268,6 +268,7 @@ def run(config: CalibrationConfig) -> int:
             COMMAND,
             without=("settings",),
             taus=config.thresholds,
+            unlike=True,
             condition=config.condition.ranges if config.condition else None,
             zoo=config.zoo_digests(),
         ),

@@ -5,8 +5,9 @@ Reads numbers by name; gives pictures. A policy has its own colour here as every
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from fgtutor.errors import ConfigError
 from fgtutor.feasibility import ood_weight
-from fgtutor.figures.style import INK, LINES, TITLE, Picture, colours_of
+from fgtutor.figures.style import DASHES, INK, LINES, TITLE, Picture, colours_of
 from fgtutor.io.validation import Positive, check_arguments
 from fgtutor.statistics import Share, auroc, brier
 from fgtutor.world.terrain import Terrain
@@ -35,13 +36,22 @@ def draw_curves(
     xlabel: str,
     ylabel: str,
     log: bool = False,
+    log_x: bool = False,
+    steps: bool = False,
     axes: Axes | None = None,
 ) -> Figure:
-    """Draw a few curves over one x; a policy's curve has the policy's colour."""
-    axes = axes or Picture(7.0, 2.9).subplots()
-    for (name, y), colour in zip(curves.items(), colours_of(curves), strict=True):
-        axes.plot(np.asarray(x), np.asarray(y), color=colour, label=name)
-    axes.set(xlabel=xlabel, ylabel=ylabel, yscale="log" if log else "linear")
+    """Draw a few curves over one x; a policy's curve has the policy's colour.
+
+    `log` and `log_x` make the axis of y or x logarithmic; `steps` joins the points by steps, for
+    what jumps.
+    """
+    axes = axes or Picture(7.2, 3.0).subplots()
+    style: dict[str, Any] = {"drawstyle": "steps-mid"} if steps else {}
+    looks = zip(colours_of(curves), itertools.cycle(DASHES), strict=False)
+    for (name, y), (colour, dash) in zip(curves.items(), looks, strict=True):
+        axes.plot(np.asarray(x), np.asarray(y), color=colour, linestyle=dash, label=name, **style)
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.set(xscale="log" if log_x else "linear", yscale="log" if log else "linear")
     axes.grid(alpha=0.25)
     if len(curves) > 1:
         axes.legend(frameon=False, fontsize=9)
@@ -59,10 +69,11 @@ def draw_losses(
     everything = np.concatenate(list(arrays.values()))
     low, high = np.log10(np.quantile(everything, (0.001, 0.999)))
     bins = np.logspace(low, high, 60)
-    for (name, values), colour in zip(arrays.items(), colours_of(arrays), strict=True):
+    looks = zip(colours_of(arrays), itertools.cycle(DASHES), strict=False)
+    for (name, values), (colour, dash) in zip(arrays.items(), looks, strict=True):
         share = np.histogram(values, bins)[0] / len(values)
         spread.stairs(share, bins, color=colour, fill=True, alpha=0.25)
-        spread.stairs(share, bins, color=colour, linewidth=1.6, label=name)
+        spread.stairs(share, bins, color=colour, linewidth=1.6, linestyle=dash, label=name)
     spread.set(xscale="log", ylabel="share of patches")
     spread.legend(frameon=False, fontsize=9)
     spread.set_title("The further right, the less the patches look like home", **TITLE, loc="left")
@@ -224,16 +235,17 @@ def training_curve(rows: Sequence[Mapping[str, float]]) -> Picture:
     figure = Picture(7.0, 6.5)
     tracking, level, loss = figure.subplots(3, 1, sharex=True)
     samples = np.array([row["samples"] for row in rows])
-    for axes, key, label, colour in (
-        (tracking, "r_v", "tracking reward r_v", "#0072B2"),
-        (tracking, "failed", "share of episodes that fail", "#D55E00"),
-        (level, "row", "mean difficulty row", "#009E73"),
-        (loss, "feasibility_feasibility", "(f - r_v)²", "#0072B2"),
-        (loss, "feasibility_reconstruction", "L_recon", "#E69F00"),
+    mark = "." if len(rows) < 3 else ""
+    for axes, key, label, colour, dash in (
+        (tracking, "r_v", "tracking reward r_v", LINES[0], "-"),
+        (tracking, "failed", "share of episodes that fail", LINES[1], "--"),
+        (level, "row", "mean difficulty row", LINES[2], "-"),
+        (loss, "feasibility_feasibility", "(f - r_v)²", LINES[0], "-"),
+        (loss, "feasibility_reconstruction", "L_recon", LINES[1], "--"),
     ):
         if all(key in row for row in rows):
             values = [row[key] for row in rows]
-            axes.plot(samples, values, ".-" if len(rows) < 3 else "-", color=colour, label=label)
+            axes.plot(samples, values, marker=mark, linestyle=dash, color=colour, label=label)
             axes.legend(loc="best", fontsize=8, frameon=False)
         axes.grid(alpha=0.25)
     tracking.set(ylim=(0, 1.02))

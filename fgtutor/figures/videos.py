@@ -19,7 +19,7 @@ from PIL import Image
 from fgtutor.errors import ConfigError
 from fgtutor.execution import Episode
 from fgtutor.figures.episode_film import FPS, EpisodeFilm
-from fgtutor.figures.style import Panels
+from fgtutor.figures.style import Panels, Photo
 from fgtutor.io.storage import atomic_write
 from fgtutor.io.validation import Positive, check_arguments
 from fgtutor.robots import ROBOTS, load
@@ -82,7 +82,7 @@ def save_video(
 
 def film_strip(
     episode: Episode, terrain: Terrain, route: Route, *, count: Panels = 8, columns: Panels = 2
-) -> Image.Image:
+) -> Photo:
     """Return views at `count` moments, evenly spread from start to end, read row by row."""
     check_arguments(film_strip, locals(), ConfigError)
     film = film_of(episode, terrain, route)
@@ -93,7 +93,13 @@ def film_strip(
     strip = Image.new("RGB", (columns * (width + gap) - gap, rows * (height + gap) - gap), "white")
     for n, view in enumerate(views):
         strip.paste(view, (n % columns * (width + gap), n // columns * (height + gap)))
-    return strip
+    drivers = ", ".join(dict.fromkeys(route.names[k] for k in episode.policies.tolist()))
+    return Photo(
+        strip,
+        f"Film strip of {count} moments of a drive by the {episode.robot}, in rows from start to "
+        f"end: {episode.length:.1f} m in {episode.seconds:.0f} s, end: {episode.reason}. "
+        f"Policies: {drivers}",
+    )
 
 
 def _write_gif(pictures: Iterator[np.ndarray], path: Path, fps: float) -> None:

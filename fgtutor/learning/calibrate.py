@@ -28,10 +28,11 @@ from fgtutor.feasibility import (
     feasibility_labels,
 )
 from fgtutor.io.validation import Count, CountOrZero, Seed, Width, check_fields
+from fgtutor.learning.config import training_tile
 from fgtutor.learning.refit import EASIEST, refitted
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.specialist import GENERAL, Specialist, load_specialist, save_specialist
-from fgtutor.world.terrain import Terrain, World, make_terrain
+from fgtutor.world.terrain import Terrain, World
 
 HELD_OUT = 2**40
 """Where the seeds of calibration terrain begin: odd, so never trained on, and beyond the seeds of
@@ -139,25 +140,31 @@ def own_terrain(
 ) -> list[Terrain]:
     """Return terrains of a specialist's kind, of seeds `first`, `first` + 2, ...
 
-    As many of them have neighbours as in its training.
+    As many of them have neighbours, or lie at any angle, as in its training.
     """
     kind = str(specialist.provenance.get("terrain", specialist.name))
     mixed = ROBOTS[specialist.robot].scale.mixed
-    training = specialist.provenance.get("config")
-    between = training.get("neighbours", 0.0) if isinstance(training, dict) else 0.0
-    if kind not in mixed or not isinstance(between, float):
-        between = 0.0
+    between, turned = (_trained_with(specialist, name) for name in ("neighbours", "turned"))
     rng = np.random.default_rng(first)
     return [
-        make_terrain(
+        training_tile(
             mixed[i % len(mixed)] if kind == GENERAL else kind,
             robot=specialist.robot,
             difficulty=float(rng.uniform(easiest, 1.0)),
             seed=first + 2 * i,
-            neighbours=bool(rng.random() < between),
+            neighbours=bool(rng.random() < between) and kind in mixed,
+            angle=float(rng.uniform(-180.0, 180.0)) if rng.random() < turned else None,
+            square=turned > 0,
         )
         for i in range(count)
     ]
+
+
+def _trained_with(specialist: Specialist, setting: str) -> float:
+    """Return a share that a specialist was trained with; 0 if its provenance does not say."""
+    training = specialist.provenance.get("config")
+    share = training.get(setting, 0.0) if isinstance(training, dict) else 0.0
+    return share if isinstance(share, float) else 0.0
 
 
 @torch.no_grad()

@@ -217,24 +217,46 @@ def training_world(config: TrainConfig, iteration: int = 0) -> World:
     between = rng.random(shape) < config.neighbours
     turned = rng.random(shape) < config.turned
     angles = rng.uniform(-180.0, 180.0, size=shape)
-    scale = ROBOTS[config.robot].scale
-    if config.turned:
-        scale = dataclasses.replace(scale, width=scale.length)
 
     def tile(row: int, column: int) -> Terrain:
-        name, seed = names[column % len(names)], int(seeds[row, column])
-        own = {
-            "robot": config.robot,
-            "difficulty": float(levels[row]),
-            "seed": seed,
-            "scale": scale,
-        }
-        if turned[row, column] and name in OBSTACLES:
-            return make_turned(name, angle=float(angles[row, column]), **own)
-        neighbours = bool(between[row, column]) and names[0] in mixed
-        return make_terrain(name, neighbours=neighbours, **own)
+        return training_tile(
+            names[column % len(names)],
+            robot=config.robot,
+            difficulty=float(levels[row]),
+            seed=int(seeds[row, column]),
+            neighbours=bool(between[row, column]) and names[0] in mixed,
+            angle=float(angles[row, column]) if turned[row, column] else None,
+            square=config.turned > 0,
+        )
 
     return World([[tile(row, column) for column in range(shape[1])] for row in range(shape[0])])
+
+
+def training_tile(
+    kind: str,
+    *,
+    robot: str,
+    difficulty: float,
+    seed: int,
+    neighbours: bool = False,
+    angle: float | None = None,
+    square: bool = False,
+) -> Terrain:
+    """Return one terrain as a training has it.
+
+    `neighbours` puts other obstacles at both ends; an `angle` (degrees) turns the obstacle, where
+    the kind is one that can be turned. Terrains of a world that has turned ones are all `square`.
+    """
+    scale = ROBOTS[robot].scale
+    if square:
+        scale = dataclasses.replace(scale, width=scale.length)
+    if angle is not None and kind in OBSTACLES:
+        return make_turned(
+            kind, robot=robot, angle=angle, difficulty=difficulty, seed=seed, scale=scale
+        )
+    return make_terrain(
+        kind, robot=robot, difficulty=difficulty, seed=seed, scale=scale, neighbours=neighbours
+    )
 
 
 def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:

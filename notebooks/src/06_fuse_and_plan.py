@@ -1,43 +1,52 @@
 # %% [markdown]
 # # 06 · Fuse and plan
 #
-# - **You will be able to** fuse the opinions of many specialists into one map, read the graph
-#   that a planner searches, find the cheapest route in it, and say why a classical costmap cannot
-# - **Time** half an hour to read; about 1 minute on two CPU cores
+# - **You will be able to** fuse the tensors of several specialists, read the graph that a planner
+#   searches, find the cheapest route by hand, and say what a classical costmap cannot express
+# - **Time** 45 minutes to read and try; about 1 minute on two CPU cores
 # - **Needs** notebooks [04](04_have_i_seen_this_before.ipynb) and
 #   [05](05_from_map_to_tensor.ipynb) for $w_\text{ood}$ and the tensor; uses the shipped
 #   specialists
 # - **If a part is slow** nothing here simulates a robot; the slowest cells ask four specialists
 #   about a whole map, a second or two each
 #
-# Four specialists have told us, for every cell and heading, how well they would do there. Now
-# there is almost nothing left to do. That is the beauty of it.
-
-# %% [markdown]
-# ## Four opinions
-#
-# Between start and goal lies a ridge, and four ways round it: rubble and slopes, gaps, steps, and
-# a long detour on the flat.
+# Four specialists have said, for every cell and heading, how well they would do there. What is left
+# is arithmetic and a graph search (paper, Sec. III-C, Fig. 4).
 
 # %%
-from fgtutor import ElevationMap, load_zoo, tensorize
+from fgtutor.course.diagrams import draw_pipeline
+
+draw_pipeline(here=6)
+
+# %% [markdown]
+# Symbols: [notation](../docs/notation.md). Derivations: [derivations](../docs/derivations.md).
+# Equation numbers are the paper's.
+#
+# ## Four tensors
+#
+# Between start and goal lies a ridge. Four lanes lead past it: rubble and slopes, gaps, steps, and
+# a long detour on flat ground.
+
+# %%
+from fgtutor import ElevationMap, load_zoo
 from fgtutor.cli.demo import GOAL, MAP, START
 from fgtutor.figures.maps import draw_elevation
 
-zoo = load_zoo("toy")
-names = tuple(zoo)
-names
-
-# %%
 M = ElevationMap.load(MAP)
+print(f"start {START} m, goal {GOAL} m")
 draw_elevation(M)
 
 # %%
-tensors = {name: tensorize(M, zoo[name], taus="calibrated") for name in names}
+from fgtutor.tensorization import assess_all
+
+zoo = load_zoo("toy")
+names = tuple(zoo)
+assessments = assess_all(M, zoo, taus="calibrated")
+tensors = {name: one.weighted() for name, one in assessments.items()}
+names
 
 # %% [markdown]
-# Look at one single cell, in the lane with the gaps. Every row is one specialist's flower,
-# written as numbers.
+# Look at one cell, in the lane with the gaps. Each row is one specialist's flower, as numbers.
 
 # %%
 import numpy as np
@@ -46,91 +55,184 @@ from fgtutor import directions
 from fgtutor.figures.charts import draw_table
 
 cell = M.cell_of(4.0, 5.6)
-opinions = np.stack([tensors[name][cell].numpy() for name in names])
+at_cell = np.stack([tensors[name][cell].numpy() for name in names])
 draw_table(
-    opinions,
+    at_cell,
     names,
     directions.NAMES,
     title=f"F of each specialist in cell {cell}, by heading",
-    caption="Read a column: who would you send that way?",
+    caption="Read a column: which specialist would you send along that heading?",
 )
 
+# %%
+from fgtutor.course.ask import predict, reveal
+
+predict("Which specialist gets heading +y, and which heading +x?", ["gaps both", "slopes, gaps"])
+
 # %% [markdown]
-# ## Fuse: take the best, remember whose it is
+# ## Fuse: keep the best value, and whose it is
 #
-# $$ \hat F_\text{max} = \max_i \hat F_i \qquad \mathcal P = \arg\max_i \hat F_i $$
+# $$ F_\text{max}(x, y, k) = \max_i F_i(x, y, k) \tag{6} $$
 #
-# For each cell *and heading* the best one is sent. That is all there is to fusion:
+# $$ P(x, y, k) = \arg\max_i F_i(x, y, k) \tag{7} $$
 
 # %%
-best = opinions.max(axis=0)
-who = opinions.argmax(axis=0)
-for heading, (value, policy) in enumerate(zip(best, who, strict=True)):
+best, owner = at_cell.max(axis=0), at_cell.argmax(axis=0)
+for heading, (value, policy) in enumerate(zip(best, owner, strict=True)):
     print(f"{directions.NAMES[heading]:5} F_max = {value:.2f}  P = {names[policy]}")
+assert names[owner[2]] == "slopes" and names[owner[0]] == "gaps"
+reveal("slopes, gaps")
+
+# %% [markdown]
+# Along +x the patch shows a gap, along +y flat ground between two gaps.
+#
+# **Careful:** where all values are 0, `argmax` still has to answer, and answers with the first name
+# of the list. "F_max = 0.00, P = gaps" means *nobody*. The planner never gets there: such a step is
+# not in its graph. For the whole map:
 
 # %%
 from fgtutor import fuse
 
 fused, policy_map = fuse(list(tensors.values()))
-tuple(fused.shape), tuple(policy_map.shape)
+assert (policy_map[fused == 0] == 0).all()  # nobody: the first name, without a meaning
+print("F_max", tuple(fused.shape), "and P", tuple(policy_map.shape))
 
 # %%
-from fgtutor.figures.maps import draw_petals, draw_policy_map
+from fgtutor.figures.maps import draw_petals
 
-draw_petals(fused, M, policy_map, names)
+part = M.crop(2.2, 5.2, 3.8, 6.4)  # where the lane with the gaps begins
+ix, iy = slice(22, 38), slice(52, 64)
+draw_petals(fused[ix, iy], part, policy_map[ix, iy], names)
 
 # %%
+from fgtutor.figures.maps import draw_policy_map
+
 draw_policy_map(policy_map, fused, M, names)
 
 # %% [markdown]
-# *What to see:* the lanes have found their owners. On the flat all are nearly equally good, so
-# there the colour means little. The ridge, its foot, and the unknown block belong to nobody.
+# *What to see:* the lanes with rubble and with gaps have the colour of their specialists. On flat
+# ground all are about equally good, so there the colour means little. The foot and the edges of the
+# ridge are black, and so is what was never observed. And along the *top* of the ridge runs a
+# coloured strip: it is flat, so the slopes specialist could drive there. But no step leads up to
+# it. A planner asked to go there refuses:
+
+# %%
+from fgtutor import plan
+
+task = {"grid": M, "names": names, "tensors": list(tensors.values())}
+on_top = plan(fused, policy_map, start=START, goal=(6.0, 4.5), **task)
+assert not on_top and fused[M.cell_of(6.0, 4.5)].max() > 0.5
+print(on_top.reason)
+
+# %% [markdown]
+# Why the *maximum*? Because only one policy will drive. With a mean, each member that cannot do
+# the job would lower the result: add a fifth specialist for stairs, and every flat road gets
+# worse. With the maximum a new member can only help, and **nobody is retrained**.
 #
-# Why the *maximum*? Because only one will drive. A mean would punish a team for every member that
-# cannot do the job: hire a fifth specialist for stairs, and all other roads get worse. With the
-# maximum a new member can only help, and **nobody is retrained**.
+# ## The planning problem
+#
+# A **path** is a chain of cells and headings $(c_0, k_0), (c_1, k_1), \dots$ in which each heading
+# leads to the next cell. The planner wants the path from start to goal with the least total cost:
+#
+# $$
+# \min_{(c_0, k_0), \dots, (c_{n-1}, k_{n-1})} \ \sum_{t=0}^{n-1}
+# \frac{1}{F_\text{max}(c_t, k_t)}
+# \qquad \text{with } F_\text{max}(c_t, k_t) \ge f_\text{min} .
+# $$
+#
+# The cost of a step, $1/F_\text{max}$, is the paper's. The limit $f_\text{min} = 0.1$
+# is ours: a step below it does not exist.
+#
+# **Why $1/F$?** Suppose the robot makes good a share $F$ of the commanded speed. Then a step takes
+# $1/F$ times as long, and the cheapest path is the fastest. $F = 1$ costs 1 and $F = 0.1$ costs 10:
+# ten easy steps round one bad step are a fair trade. ($F$ is a tracking reward, so this is not
+# exact, but it is the right kind of quantity: a velocity.)
+#
+# **Why not $-\log F$?** Then the sum is the logarithm of a product, and the cheapest path is the
+# likeliest to succeed: right if $F$ were the probability of surviving a step, each independent of
+# the others. It is not. And $-\log 1 = 0$ would make perfect ground free: a detour of any length
+# would cost nothing. ([Derivation](../docs/derivations.md).)
 
 # %% [markdown]
 # ## A graph you can read
 #
-# A planner does not see maps. It sees a **graph**: a node for each cell, an arrow for each step
-# that somebody can do. Cut a handful of cells out of the tensor, where the gap lane begins:
+# A planner sees no map. It sees a **graph**: one node per cell, one arrow per step that some policy
+# can do. Cut 24 cells out of the tensor, where the lane with the gaps begins:
 
 # %%
 from fgtutor.planning import as_networkx
 
 ix, iy = M.cell_of(2.2, 5.6)
 window = slice(ix, ix + 6), slice(iy, iy + 4)
-tiny = ElevationMap(
-    M.heights[window], resolution=M.resolution, origin=tuple(M.resolution * np.array((ix, iy)))
-)
+corner = tuple(M.resolution * np.array((ix, iy)))
+tiny = ElevationMap(M.heights[window], resolution=M.resolution, origin=corner)
 graph = as_networkx(fused[window].numpy(), policy_map[window].numpy())
 print(graph)
 
 # %%
-for tail, head, edge in list(graph.out_edges((1, 1), data=True)):
+for tail, head, edge in graph.out_edges((1, 1), data=True):
     heading, policy = directions.NAMES[edge["heading"]], names[edge["policy"]]
     print(f"{tail} -> {head}  {heading:5} F = {edge['feasibility']:.2f} ({policy:6})", end="  ")
     print(f"cost = 1 / F = {edge['weight']:.2f}")
 
 # %% [markdown]
-# The **cost** of an arrow is $1/\hat F_\text{max}$: a step that nearly certainly works costs
-# little more than 1, one with $F = 0.1$ costs 10, so ten good steps round a bad one are a fair
-# trade. Below `f_min` (0.1, unless you say otherwise) there is no arrow at all.
+# ## Dijkstra's algorithm, step by step
 #
-# **Dijkstra's algorithm** finds the cheapest way: always go on from the node that is cheapest to
-# reach so far, and no node need ever be looked at twice.
+# Keep a list of nodes with the cheapest cost found *so far*: the **frontier**. Take the cheapest
+# node off it. Its cost is now final (it is **settled**): any other path to it would have to go
+# through a node of the frontier that already costs as much. Then offer each neighbour the path
+# through this node, and go on.
+#
+# **Your line.** A node was settled at a cost of 2.75. An arrow with F = 0.5 leads from it to a
+# neighbour. What does the neighbour cost on this path?
 
 # %%
-from itertools import pairwise
+settled_cost, F = 2.75, 0.5
+offer = ...  # a formula of settled_cost and F
 
+if offer is ...:
+    print("Not filled in yet: replace the three dots.")
+else:
+    assert offer == 4.75, f"got {offer}: the cost so far plus the cost of the arrow, 1 / F"
+    print("Right.")
+
+# %%
+import heapq
+
+
+def dijkstra(graph, start):
+    cost, before, settled = {start: 0.0}, {}, {}
+    frontier = [(0.0, start)]
+    while frontier:
+        _, node = heapq.heappop(frontier)
+        if node in settled:
+            continue  # a dearer path to a node that is settled
+        settled[node] = cost[node]
+        for neighbour in graph[node]:
+            offer = cost[node] + graph.edges[node, neighbour]["weight"]
+            if offer < cost.get(neighbour, np.inf):
+                cost[neighbour], before[neighbour] = offer, node
+                heapq.heappush(frontier, (offer, neighbour))
+        if len(settled) <= 5:
+            waiting = sorted((cost[n], n) for n in cost if n not in settled)
+            print(f"settled {node} at {cost[node]:.2f}; frontier:", end=" ")
+            print(", ".join(f"{n} {c:.2f}" for c, n in waiting[:5]))
+    return settled, before
+
+
+settled, before = dijkstra(graph, (0, 0))
+
+# %%
 import networkx
 
-path = networkx.dijkstra_path(graph, (0, 0), (5, 3))
-cost = sum(graph.edges[step]["weight"] for step in pairwise(path))
-print(" -> ".join(str(node) for node in path))
-print(f"cost, added up by hand: {cost:.3f}")
-print(f"cost, says networkx:    {networkx.dijkstra_path_length(graph, (0, 0), (5, 3)):.3f}")
+path = [(5, 3)]
+while path[-1] in before:
+    path.append(before[path[-1]])
+path.reverse()
+print(" -> ".join(map(str, path)))
+costs = list(settled.values())
+assert costs == sorted(costs)  # nodes are settled in the order of their cost
+assert np.isclose(settled[5, 3], networkx.dijkstra_path_length(graph, (0, 0), (5, 3)))
 
 # %%
 from fgtutor.course.route_pictures import draw_graph
@@ -138,19 +240,30 @@ from fgtutor.course.route_pictures import draw_graph
 draw_graph(graph, tiny, path, names)
 
 # %% [markdown]
-# *What to see:* every cell has up to eight arrows out, in the colour of the policy that is sent.
+# *What to see:* each cell has up to eight arrows out, in the colour of the policy that is sent.
 # There and back are two arrows, and they need not cost the same.
+#
+# ## And A*?
+#
+# A* adds to each cost a guess of what is still to come, and so settles fewer nodes. It finds the
+# cheapest path if the guess is **admissible**: never too high. The paper uses Dijkstra since costs
+# depend on direction and policy. But a safe guess exists: $F \le 1$, so a step never costs less
+# than its length, and the straight line to the goal never guesses too high. Move the slider:
+
+# %%
+from fgtutor.course.widgets.slides import FrontierSlides
+
+FrontierSlides(M, fused, START, GOAL)
 
 # %% [markdown]
 # ## The whole map
 #
-# The same, with some ten thousand nodes. `plan` takes metres and gives a `Route`.
+# `plan` takes metres and gives a `Route`. With `PAPER` a step costs $1/F$ and switching is free.
 
 # %%
-from fgtutor import plan
 from fgtutor.planning import PAPER
 
-task = {"grid": M, "start": START, "goal": GOAL, "names": names, "tensors": list(tensors.values())}
+task |= {"start": START, "goal": GOAL}
 route = plan(fused, policy_map, settings=PAPER, **task)
 route
 
@@ -160,89 +273,103 @@ from fgtutor.figures.maps import draw_route
 draw_route(route, M)
 
 # %% [markdown]
-# *What to see:* there are four ways round the ridge. Which one did it take, and who drives? It
-# weighs a short way that somebody finds a little hard against a long one that everybody finds
-# easy.
+# *What to see:* of the four lanes it takes the one with rubble and slopes, right past the ridge.
+# The flat detour would be four metres longer.
 #
+# **$1/F$ against $-\log F$, once more.** If $F$ were the probability of surviving a step, the
+# robot would hardly ever arrive:
+
+# %%
+print(f"product of F along the route: {route.feasibility.prod():.0e}")
+assert route.feasibility.prod() < 1e-6
+
+# %% [markdown]
+# In notebook 07 the robot drives such routes, and arrives.
+
+# %% [markdown]
 # ## Ask it why
 #
-# No step of this route is a secret. Here is the one that it liked least:
+# The route can explain each of its steps. Here is the dearest one:
 
 # %%
-worst = max(route.explain(), key=lambda step: step["cost"])
-for key, value in worst.items():
-    if isinstance(value, dict):
-        value = {name: round(number, 2) for name, number in value.items()}
-    print(f"{key:8} {value if not isinstance(value, float) else round(value, 4)}")
+dearest = max(route.explain(), key=lambda step: step["cost"])
+print(f"in cell {dearest['cell']} towards {dearest['heading']}, driven by {dearest['policy']}")
+print(f"F_max {dearest['F_max']:.2f}, cost {dearest['cost']:.2f}: ", end="")
+print(f"{dearest['share']:.1%} of what the whole route costs")
+print("F of each:", {name: round(value, 2) for name, value in dearest["F"].items()})
 
 # %% [markdown]
-# And why did it not go elsewhere? Ask about a cell that is black in the policy map, and about one
-# in the hatched block:
+# Why did it not drive straight over the ridge? And not through the hatched block? Ask about a cell
+# of each:
 
 # %%
-from fgtutor import assess
 from fgtutor.tensorization import why_blocked
 
-assessments = {name: assess(M, specialist) for name, specialist in zoo.items()}
-ix, _ = M.cell_of(6.0, 4.0)
-shut = int((fused[ix].amax(dim=-1) < 0.1).nonzero()[-1])  # in this column of cells
-for x, y in (M.centre_of(ix, shut), (5.7, 6.4)):
-    print(why_blocked(x, y, assessments))
+ridge, hatched = (why_blocked(x, y, assessments) for x, y in ((6.0, 4.2), (5.7, 6.4)))
+print(ridge, hatched, sep="\n\n")
+assert "never observed" in hatched and "never observed" not in ridge
 
 # %% [markdown]
-# A learned planner that goes from map to motion in one network could not have told you. This is
-# what the paper means by *transparency*: the learning is in the opinions, and the decision is
-# arithmetic.
+# The first is closed because each specialist either does not know such ground or would not keep its
+# speed; the second because nobody has seen it. This is what the paper means by *transparency*: the
+# learning is in $f$ and $w_\text{ood}$, and the decision is arithmetic.
+
+# %% [markdown]
+# ## When two are equally good
 #
-# ## The flickering of equals
-#
-# Look at the number of switches in the route above. On flat ground several policies are almost
-# equally good, and $\mathcal P$ changes its mind from cell to cell. The paper's plan does not
-# mind: switching is free there. A real robot stumbles a little at each switch. So let a switch
-# cost something, as much as a metre of easy ground. And let a diagonal step cost its length: by
-# $1/\hat F$ alone it costs as much as a straight one, and routes zigzag. These are our settings,
-# `PlanSettings()`; the paper's are `PAPER`. Everything in this package uses one of the two:
+# The route above switches between slopes and rubble several times. On flat ground both are about
+# equally good, and $P$ changes from cell to cell. In the paper's plan switching is free; a
+# real robot may stumble at each switch. So we let a switch cost as much as a metre of ideal ground.
+# And a diagonal step costs its length: by $1/F$ alone it costs as much as a straight one. These are
+# our settings, `PlanSettings()`; the paper's are `PAPER`.
 
 # %%
 from fgtutor.course.route_pictures import compare_routes
 
 calm = plan(fused, policy_map, **task)
-compare_routes(M, {"the paper's settings": route, "ours: a switch costs 1": calm})
+assert calm.switches < route.switches and calm.length <= route.length
+compare_routes(M, {"the paper's settings": route, "ours: a switch costs 1 m": calm})
 
 # %% [markdown]
-# *What to see:* fewer switches, at hardly any price in length.
+# *What to see:* fewer switches, and the route is no longer for it.
 
 # %% [markdown]
 # ## The paper in one file
 #
-# Notebooks 04 to 06 are Secs. III-B and III-C of the paper. Written down as it says, slowly and
-# without any of our tricks, they fit into 91 lines: `fgtutor/paper.py`. Read it from top to bottom
-# once; you know every line of it by now. Here is its last function. Does it agree with the fast
-# way? It asks for one patch after the other, so a part of the map will do: from the start into the
-# gap lane.
+# Notebooks 04 to 06 are Secs. III-B and III-C of the paper. `fgtutor/paper.py` writes them down as
+# they stand there, slowly and without our tricks. You have read its first half in notebook 05. Here
+# is the rest: the graph and the plan.
 
 # %%
 import inspect
 
 from fgtutor import paper
-from fgtutor.planning import plan_on_map
 
+print(inspect.getsource(paper.graph))
 print(inspect.getsource(paper.plan))
 
+# %% [markdown]
+# Does it agree with the fast way? It cuts one patch after the other, so a part of the map will do:
+# from the start into the lane with the gaps.
+
 # %%
-part, gaps = M.crop(0.5, 3.0, 4.0, 6.5), (3.5, 5.6)
-cells, policies, cost = paper.plan(part, zoo, START, gaps)
-fast = plan_on_map(part, zoo, START, gaps, settings=PAPER).route
+from fgtutor.planning import plan_on_map
+
+part, in_lane = M.crop(0.5, 3.0, 4.0, 6.5), (3.5, 5.6)
+cells, policies, cost = paper.plan(part, zoo, START, in_lane)
+fast = plan_on_map(part, zoo, START, in_lane, settings=PAPER).route
+assert np.isclose(cost, fast.cost, rtol=1e-4)
 print(f"cost of the cheapest route: paper.py {cost:.4f}, the fast way {fast.cost:.4f}")
 
 # %% [markdown]
 # ## A ledge is a one-way street
 #
-# Now for the classical planner. A costmap turns heights into *one* number a cell, with
-# thresholds. What it cannot say is "down yes, up no". So let us find the most one-way ledge there
-# is for our team:
+# Now for the classical planner. A costmap turns heights into *one* number per cell, by thresholds.
+# It cannot say "down yes, up no". Which ledge is the most one-way for our team?
 
 # %%
+from fgtutor import tensorize
+
 rises = np.arange(0.04, 0.26, 0.02)
 
 
@@ -263,13 +390,14 @@ from fgtutor.figures.charts import draw_curves
 draw_curves(
     rises,
     {"up": ups, "down": downs},
-    title="The worst F_max on the way over a ledge",
+    title="The lowest F_max on the way over a ledge",
     xlabel="height of the ledge (m)",
     ylabel="F_max",
 )
 
 # %%
 rise = float(rises[(downs - ups).argmax()])
+assert (downs - ups).max() > 0.3 > ups[(downs - ups).argmax()]
 heights = np.zeros((50, 44))
 heights[20:, :28] = rise  # the ledge itself
 heights[14:, 28:] = rise / 2  # further up, the same height in two small steps
@@ -279,37 +407,58 @@ print(f"a ledge of {rise:.2f} m, and beside it two of {rise / 2:.2f} m")
 draw_elevation(L)
 
 # %% [markdown]
-# Plan from the low side to the high side and back, with our tensors, and with a
-# **traversability** map: slope, step height and roughness of each cell against critical values,
-# the standard of the field. The same search on both.
+# Plan from the low side to the high side and back. The opponent is a **traversability** map (after
+# Wermelinger et al., 2016): slope, height of a step and roughness of each cell against critical
+# values. We let it use our policy map and switch for free. Its critical values:
 
 # %%
-from fgtutor.baselines import AssessedMap, find_route, planners
+from fgtutor.baselines import TraversabilityConfig
 
-low_side, high_side = (0.6, 1.6), (4.4, 1.6)
-ground = AssessedMap(L, zoo)
-
-
-def ask(name, start, goal):
-    return find_route(planners(zoo)[name], ground, start, goal)  # a Route, or a Refusal
-
+cautious, bold = TraversabilityConfig(), TraversabilityConfig(step=0.25, roughness=0.1)
+for name, critical in {"as published": cautious, "raised for this robot": bold}.items():
+    print(f"{name}: slope {critical.slope} rad, ", end="")
+    print(f"step {critical.step} m, roughness {critical.roughness} m")
 
 # %%
-compare_routes(
-    L,
-    {
-        "ours, up": ask("ours", low_side, high_side),
-        "ours, down": ask("ours", high_side, low_side),
-        "traversability, up": ask("traversability+P", low_side, high_side),
-        "traversability, down": ask("traversability+P", high_side, low_side),
-    },
+predict(
+    "Which traversability map finds the better route: the one as published, or the one with raised "
+    "thresholds?",
+    ["as published", "raised", "depends on the direction"],
 )
 
+# %%
+from fgtutor.baselines import AssessedMap, classical_switched, find_route, ours, traversability
+
+
+def costmap(critical):
+    return lambda ground: classical_switched(lambda M, r: traversability(M, r, critical), ground)
+
+
+ground = AssessedMap(L, zoo)
+low_side, high_side = (0.6, 2.0), (4.4, 2.0)
+routes = {}
+for way, ends in {"up": (low_side, high_side), "down": (high_side, low_side)}.items():
+    routes[f"ours, {way}"] = find_route(ours, ground, *ends)
+    for name, critical in {"as published": cautious, "raised": bold}.items():
+        found = find_route(costmap(critical), ground, *ends, switch_cost=0.0)
+        routes[f"{name}, {way}"] = found
+
+# %%
+compare_routes(L, routes, columns=3)
+
+# %%
+metres = {name: round(one.length, 1) for name, one in routes.items()}
+assert metres["ours, up"] > metres["ours, down"]
+assert metres["as published, up"] == metres["as published, down"]
+assert metres["raised, up"] == metres["raised, down"]
+print(metres)
+reveal("depends on the direction")
+
 # %% [markdown]
-# *What to see:* going up, ours prefers the two small steps if the big one is worse than the way
-# round; going down, it has no reason to. The classical planner has one opinion of the ledge for
-# both ways, and thresholds that do not know who drives. (It may even find no way at all: to its
-# thresholds the ledge is a wall.)
+# *What to see:* ours goes up by the two small steps and comes down over the ledge. As published,
+# the costmap takes the detour in both directions: downhill its route is longer than it need be.
+# With raised thresholds it takes the ledge in both directions: uphill, where our $F$ is below 0.3.
+# No threshold gets both right, because a cell has only one number.
 #
 # And where there is no way round? A corridor with all four obstacles across its whole width:
 
@@ -319,40 +468,69 @@ from fgtutor import make_terrain
 for seed in range(1, 40, 2):
     corridor = make_terrain("mixed", robot="toy", seed=seed)
     ground = AssessedMap(corridor.elevation, zoo)
-    answer = ask("ours", corridor.start, corridor.goal)
+    answer = find_route(ours, ground, corridor.start, corridor.goal)
     print(f"corridor {seed}: {answer}")
     if answer:  # a Refusal is False
         break
 
 # %%
 ends = corridor.start, corridor.goal
-compare_routes(
-    corridor.elevation,
-    {
-        "ours": answer,
-        "ours, without headings": ask("no-heading", *ends),
-        "traversability": ask("traversability+P", *ends),
-        "occupancy grid": ask("occupancy+P", *ends),
-    },
-    columns=1,
-)
+refused = find_route(costmap(bold), ground, *ends, switch_cost=0.0)
+assert answer and not refused
+compare_routes(corridor.elevation, {"ours": answer, "costmap, raised": refused}, columns=1)
 
 # %% [markdown]
-# *What to see:* the costmaps know flat ground and obstacles, and to them what the specialists can
-# do is an obstacle. They are not stupid; they have just never been told what this robot can do.
-# (Where ours refused, above, no specialist knew some of the ground. In notebook 07 you will see
-# whether such refusals are wise.)
+# *What to see:* even the raised thresholds close the corridor. A gap is half a metre deep; to a
+# costmap that is a step of half a metre, and raising the threshold so far would open every wall. It
+# is not stupid. Nobody has told it what this robot can do.
+
+# %% [markdown]
+# ## What you now know
+#
+# - $F_\text{max}$ is the best value and $P$ its owner (Eqs. 6, 7). Where
+#   everything is 0, $P$ means nothing.
+# - A step costs $1/F_\text{max}$, an expected time; steps below $f_\text{min}$ do
+#   not exist. Dijkstra settles nodes in the order of their cost.
+# - The straight line is an admissible guess for A* when a step costs its length over $F$.
+# - A new specialist can only raise $F_\text{max}$. Nobody is retrained.
+# - One number per cell cannot tell up from down, whatever the threshold.
+#
+# **Test yourself**
+#
+# <details><summary>1. Specialist A offers (0.8, 0.1), B offers (0.3, 0.5) for two headings. F_max,
+# P, and the costs?</summary>
+#
+# F_max = (0.8, 0.5), P = (A, B), costs 1.25 and 2.
+# </details>
+#
+# <details><summary>2. Dijkstra settles a node at cost 7. Can a later path reach it for 6?</summary>
+#
+# No. That path would leave the settled part through a node of the frontier. All of those cost at
+# least 7 when this node is taken, and arrows only add to it.
+# </details>
+#
+# <details><summary>3. When would $-\log F$ be the right cost?</summary>
+#
+# If F were the probability to survive a step, independent of the other steps, and only survival
+# counted, not time.
+# </details>
 
 # %% [markdown]
 # ## What to try
 #
-# - Replace the maximum by the mean: `torch.stack(list(tensors.values())).mean(dim=0)` as `fused`.
-#   Which lane does the route take, if any?
-# - Fire the gaps specialist. Plan again. What does the second best way cost?
-# - `plan(..., cost="inverse")` is the paper's cost alone: a diagonal step costs as much as a
-#   straight one. Compare the routes.
-# - `plan(..., backend="networkx")` searches the graph you have seen. Compare cost and time with
-#   the default.
+# - Replace the maximum by the mean: `torch.stack(list(tensors.values())).mean(dim=0)`.
+#   <details><summary>Answer</summary>In a lane where only one of four knows the ground, the mean is
+#   a quarter of its F: below 0.25. The step is four times as dear, or closed.</details>
+# - Leave the rubble specialist out and plan again. What does the second-best route cost?
+#   <details><summary>Answer</summary>Give <code>fuse</code> and <code>tensors</code> the other
+#   three. If the lane past the ridge closes, the route takes another lane; its cost tells how much
+#   this specialist was worth here.</details>
+# - `plan(..., backend="networkx")` searches the graph you have seen. Compare cost and time.
+#   <details><summary>Answer</summary>The same cost up to rounding; the time is much longer, since
+#   each arrow is a Python object.</details>
+# - Tensorize with `headings=16` or `32`, fuse and plan.
+#   <details><summary>Answer</summary>The route gets shorter where the goal lies between two compass
+#   directions.</details>
 #
 # **Exercises:** [exercises/ex06.ipynb](../exercises/ex06.ipynb). **Next:** drive it,
 # [07_drive_the_plan.ipynb](07_drive_the_plan.ipynb).

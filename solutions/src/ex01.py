@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Exercise 01 · Elevation maps and patches
 #
-# **You will be able to** find the cell of a point, cut a patch the way the library does, and say in
-# numbers why up a step is not down a step.
+# **You will be able to** find the cell of a point, cut a patch out of a map, and say in numbers why
+# up a step is not down a step.
 #
-# About 30 minutes. Needs notebook 01, numpy, and no GPU.
+# About 50 minutes. Needs notebook 01, numpy, and no GPU.
 #
 # Write each function below its question, then run the `check` beneath it: it says at once what
 # holds and what does not. Each call of `hint` gives one more hint. The grader runs this notebook
@@ -14,7 +14,7 @@
 # %%
 import numpy as np
 
-from fgtutor.course.checks import check, hint, solution
+from fgtutor.course.checks import check, hint, solution, with_mine
 from fgtutor.directions import STEPS
 
 # %% [markdown]
@@ -24,8 +24,8 @@ from fgtutor.directions import STEPS
 # `resolution` metres wide. With the origin at (1, 2) and cells of 0.5 m, the point (1.7, 2.2) lies
 # 0.7 m right of the corner: in cell 1, since $0.7 / 0.5 = 1.4$. Its row is 0.
 #
-# Return the cells `[n, 2]` of the points `xy [n, 2]`, also for points left of the map: 0.1 m left
-# of the corner is cell -1.
+# Return the cells `[n, 2]` of the points `xy [n, 2]` as integers, also for points left of the map:
+# 0.1 m left of the corner is cell -1.
 
 
 # %%
@@ -45,28 +45,7 @@ hint("ex01.q1")
 # %% [markdown]
 # ## ex01.q2
 #
-# A step of 12 cm is the same step on every floor. So a patch holds heights **relative to the ground
-# under the robot**: the median height of the cells under its footprint. The median, because one
-# stone under a foot must not lift the whole world.
-#
-# `footprint` is a boolean mask of the patch's shape.
-
-
-# %%
-def relative_patch(patch, footprint):
-    """Return the patch's heights relative to the ground under the robot."""
-    # BEGIN SOLUTION
-    return patch - np.median(patch[footprint])
-    # END SOLUTION
-
-
-# %%
-check("ex01.q2", relative_patch)
-
-# %% [markdown]
-# ## ex01.q3
-#
-# A patch looks the way the robot looks. Its points are given in the robot's frame, as offsets
+# A patch looks where the robot looks. Its points are given in the robot's frame, as offsets
 # (ahead, left); the robot stands at `pose = (x, y, yaw)`, yaw in radians, counter-clockwise from
 # +x. So the offsets are turned by the yaw,
 #
@@ -89,15 +68,52 @@ def patch_points(offsets, pose):
 
 
 # %%
-check("ex01.q3", patch_points)
+check("ex01.q2", patch_points)
+
+# %% [markdown]
+# ## ex01.q3
+#
+# Now cut the patch. `heights [nx, ny]` belong to the **centres** of the cells: that of cell (0, 0)
+# lies at `origin + resolution / 2`. Between four centres the height is bilinear: with $a$ and $b$
+# the fractions of a cell by which the point lies beyond the lower centre along x and along y, the
+# four heights have the weights $(1-a)(1-b)$, $(1-a)\,b$, $a\,(1-b)$ and $a\,b$. If one of the four
+# cells is off the map, the height is unknown: NaN.
+#
+# A step of 12 cm is the same step on every floor. So return heights **relative to the ground under
+# the robot**: the median of the heights of the points that `under [n]` marks, which lie below its
+# body. The median, because one stone under a foot must not lift the whole world. (The points under
+# the robot are always on the map.)
+
+
+# %%
+def cut_patch(heights, origin, resolution, pose, offsets, under):
+    """Return the heights [n] at the offsets [n, 2] of a robot, relative to its ground."""
+    # BEGIN SOLUTION
+    cells = (patch_points(offsets, pose) - origin) / resolution - 0.5
+    low = np.floor(cells).astype(int)
+    beyond = cells - low
+    patch = np.zeros(len(offsets))
+    for corner in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        cell = low + corner
+        inside = ((cell >= 0) & (cell < heights.shape)).all(axis=-1)
+        height = np.full(len(offsets), np.nan)
+        height[inside] = heights[cell[inside, 0], cell[inside, 1]]
+        share = np.where(np.array(corner) == 1, beyond, 1 - beyond).prod(axis=-1)
+        patch += share * height
+    return patch - np.median(patch[under])
+    # END SOLUTION
+
+
+# %%
+check("ex01.q3", cut_patch)
 
 # %% [markdown]
 # ## ex01.q4
 #
 # Heading $k$ points $45k$ degrees counter-clockwise from +x, and `STEPS[k]` is its step
 # `(dix, diy)`. For every cell of `heights [nx, ny]`, return how much higher the neighbour along the
-# heading is. The same border between two cells is +0.2 along heading 0 and -0.2 along heading 4: no
-# single number a cell, such as a costmap has, can hold both.
+# heading is. The same border between two cells is +0.2 along heading 0 and -0.2 along heading 4: a
+# costmap, with a single number per cell, cannot hold both.
 #
 # Off the map there is no neighbour: NaN.
 
@@ -118,6 +134,15 @@ def rise(heights, heading):
 
 # %%
 check("ex01.q4", rise)
+
+# %% [markdown]
+# ## Your own planner
+#
+# What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
+# functions in place of the library's, and the picture says which stages are yours.
+
+# %%
+with_mine("ex01")
 
 # %% [markdown]
 # ## What to try

@@ -2,9 +2,9 @@
 # # Exercise 02 · A robot that falls
 #
 # **You will be able to** compute the tracking reward, turn a rollout into labels that do not hide a
-# fall, and write the two formulas at PPO's heart.
+# fall, write the two formulas at the heart of PPO, and compute a point of a learning curve.
 #
-# About 35 minutes. Needs notebook 02, numpy, and no GPU.
+# About 50 minutes. Needs notebook 02, numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex02.q1")` gives one more
 # hint at each call, and `solution("ex02.q1")` opens once the check has passed.
@@ -12,7 +12,7 @@
 # %%
 import numpy as np
 
-from fgtutor.course.checks import check, hint, solution
+from fgtutor.course.checks import check, hint, solution, with_mine
 
 # %% [markdown]
 # ## ex02.q1
@@ -23,7 +23,7 @@ from fgtutor.course.checks import check, hint, solution
 # \text{ m/s}.$$
 #
 # It is the norm, not its square: an error of 0.25 m/s leaves $1/e \approx 0.37$, one of 0.05 m/s
-# already costs 18 %. Velocities are planar, `[n, 2]`: one row a robot.
+# already costs 18 %. Velocities are planar, `[n, 2]`: one row per robot.
 
 
 # %%
@@ -122,6 +122,53 @@ def clipped_objective(ratio, advantage, epsilon):
 
 # %%
 check("ex02.q4", clipped_objective)
+
+# %% [markdown]
+# ## ex02.q5
+#
+# A learning curve has one point per rollout. All tables are `[T, n]`: $T$ steps of $n$ robots that
+# move at the same time, each with episodes of its own. `fell` marks the step in which a robot
+# falls, `timed_out` the step in which its time is up; either ends the episode, and the robot's next
+# step begins a new one.
+#
+# Over all episodes that ended, return the mean **sum** of rewards, the share that ended by a fall,
+# and the mean number of steps. The episode that a robot is in at the end of the rollout has not
+# ended and does not count. If none has ended, return NaN three times.
+
+
+# %%
+def episode_statistics(rewards, fell, timed_out):
+    """Return (mean return, share that fell, mean length) of the episodes that ended."""
+    # BEGIN SOLUTION
+    returns, falls, lengths = [], [], []
+    steps, robots = rewards.shape
+    for robot in range(robots):
+        earned, length = 0.0, 0
+        for t in range(steps):
+            earned += rewards[t, robot]
+            length += 1
+            if fell[t, robot] or timed_out[t, robot]:
+                returns.append(earned)
+                falls.append(fell[t, robot])
+                lengths.append(length)
+                earned, length = 0.0, 0
+    if not lengths:
+        return np.nan, np.nan, np.nan
+    return np.mean(returns), np.mean(falls), np.mean(lengths)
+    # END SOLUTION
+
+
+# %%
+check("ex02.q5", episode_statistics)
+
+# %% [markdown]
+# ## Your own planner
+#
+# What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
+# functions in place of the library's, and the picture says which stages are yours.
+
+# %%
+with_mine("ex02")
 
 # %% [markdown]
 # ## What to try

@@ -12,7 +12,7 @@
 # %%
 import numpy as np
 
-from fgtutor.course.checks import check, hint, solution
+from fgtutor.course.checks import check, hint, solution, with_mine
 
 # %% [markdown]
 # ## ex04.q1
@@ -46,8 +46,7 @@ hint("ex04.q1")
 # 0,\ 1\right).$$
 #
 # Below $\tau_{low}$ the terrain is as good as known, above $\tau_{high}$ the net's prediction is
-# not believed at all. Half way between, at 1.05 with the paper's 0.1 and 2.0, it is believed by
-# half.
+# not believed at all. At 1.05, half way between the paper's 0.1 and 2.0, it counts half.
 
 
 # %%
@@ -66,9 +65,10 @@ check("ex04.q2", ood_weight)
 #
 # The paper's thresholds suit the paper's networks. A specialist of ours was driven over held-out
 # terrain of its own kind, and remembers the losses it found there. Then a patch needs no threshold:
-# its **p-value** is the share of those own losses that are at least as large as its own loss, and
-# its weight is $\operatorname{clip}(p / \alpha, 0, 1)$. So at most a share of $\alpha$ of the own
-# terrain loses weight, whatever the network.
+# its **p-value** is the share of those own losses that are at least as large as its own loss (a
+# count over a count: nothing is interpolated), and its weight is
+# $\operatorname{clip}(p / \alpha, 0, 1)$. So at most a share of $\alpha$ of the own terrain loses
+# weight, whatever the network.
 
 
 # %%
@@ -86,18 +86,34 @@ check("ex04.q3", conformal_weight)
 # %% [markdown]
 # ## ex04.q4
 #
-# A judgement, with a number. On a certain patch the net predicts $f = 0.9$. The planner uses
-# $F = w_{ood} f$ and closes an edge where $F < f_{min} = 0.1$. With the paper's thresholds 0.1 and
-# 2.0: up to which $L_{recon}$ does the place stay open? (Half a percent off is close enough.)
+# A judgement, with a number and a reason. On a certain patch the net predicts $f = 0.9$. The
+# planner uses $F = w_{ood} f$ and closes an edge where $F < f_{min} = 0.1$. With the paper's
+# thresholds 0.1 and 2.0: up to which $L_{recon}$ does the place stay open? (Half a percent off is
+# close enough.) And: would you want it to stay open that long?
 
 # %%
 # BEGIN SOLUTION
 # F = 0.1 needs w_ood = 0.1 / 0.9 = 1/9; solve 1 - (L - 0.1) / 1.9 = 1/9 for L.
+# A place that the net likes stays open until it is nearly as foreign as tau_high: f is believed to
+# the last, although just there it means least. What protects the robot is the price: F = 0.1 costs
+# as much as ten good steps, so the route goes there only if the detour is longer than that.
 largest_loss = 0.1 + 1.9 * (1 - 0.1 / 0.9)
 # END SOLUTION
 
 # %%
 check("ex04.q4", largest_loss)
+
+# %% [markdown]
+# *Why? Two or three sentences, for a teacher to read:*
+
+# %% [markdown]
+# ## Your own planner
+#
+# What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
+# functions in place of the library's, and the picture says which stages are yours.
+
+# %%
+with_mine("ex04")
 
 # %% [markdown]
 # ## What to try

@@ -1,10 +1,11 @@
 # %% [markdown]
 # # Exercise 05 · From map to tensor
 #
-# **You will be able to** slide a window over a map, see a network's first layer as a convolution,
-# turn a tensor together with its headings, and reconstruct without decoding.
+# **You will be able to** slide a window over a map with as little work as possible, see a network's
+# first layer as a convolution, turn a tensor together with its headings, reconstruct without
+# decoding, and update a tensor where the map has changed.
 #
-# About 40 minutes. Needs notebook 05, numpy, and no GPU.
+# About 75 minutes. Needs notebook 05, numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex05.q1")` gives one more
 # hint at each call, and `solution("ex05.q1")` opens once the check has passed.
@@ -12,30 +13,47 @@
 # %%
 import numpy as np
 
-from fgtutor.course.checks import check, hint, solution
+from fgtutor.course.checks import check, hint, solution, with_mine
 
 # %% [markdown]
 # ## ex05.q1
 #
-# To assess a map, a window of `rows` x `columns` cells slides over `heights [nx, ny]`, one cell at
-# a time. The window at `[i, j]` has its lowest corner at cell `(i, j)`: it holds
-# `heights[i : i + rows, j : j + columns]`, flattened as it lies, so y (the second axis) runs
-# fastest.
+# To assess a map, a window slides over `heights [nx, ny]`, one cell at a time, for each heading.
+# Here there are four: index 0 is +x, 1 is +y, 2 is -x, 3 is -y. The window of a robot at cell (ix,
+# iy) has `rows` x `columns` cells (`columns` is odd): the robot stands in the middle of the first
+# row, rows follow **ahead**, columns run from its right to its left. Along +x that is
+# `heights[ix : ix + rows, iy - columns // 2 : iy + columns // 2 + 1]`; along the other headings the
+# window turns with the robot. Its heights are taken relative to the robot's own cell.
 #
-# Return all windows that fit: `[nx - rows + 1, ny - columns + 1, rows * columns]`.
+# `ask(windows)` is the network: it takes windows `[n, rows * columns]`, flattened, and returns
+# their feasibilities `[n]`. It is expensive, so your work is **counted**, whatever the clock says:
+# at most four calls, every window asked exactly once. A window that leaves the map, or holds an
+# unknown cell (NaN), is not asked; its feasibility is 0.
 
 
 # %%
-def windows(heights, rows, columns):
-    """Return every window of the map, flattened."""
+def tensorize(heights, rows, columns, ask):
+    """Return the feasibilities [nx, ny, 4] of all cells along the four headings."""
     # BEGIN SOLUTION
-    view = np.lib.stride_tricks.sliding_window_view(heights, (rows, columns))
-    return view.reshape(*view.shape[:2], rows * columns)
+    tensor, half = np.zeros((*heights.shape, 4)), columns // 2
+    for k in range(4):
+        # Turned back by k quarters, the robot looks along +x.
+        turned_map = np.rot90(heights, -k)
+        view = np.lib.stride_tricks.sliding_window_view(turned_map, (rows, columns))
+        windows = view.reshape(*view.shape[:2], rows * columns)
+        own = turned_map[: len(windows), half : half + windows.shape[1]]
+        relative = windows - own[..., None]
+        known = np.isfinite(relative).all(axis=-1)
+        plane = np.zeros(turned_map.shape)
+        inner = plane[: len(windows), half : half + windows.shape[1]]
+        inner[known] = ask(relative[known])
+        tensor[..., k] = np.rot90(plane, k)
+    return tensor
     # END SOLUTION
 
 
 # %%
-check("ex05.q1", windows)
+check("ex05.q1", tensorize)
 
 # %%
 hint("ex05.q1")
@@ -117,10 +135,51 @@ def reconstruction(codes, squares, products, gram):
 check("ex05.q4", reconstruction)
 
 # %% [markdown]
+# ## ex05.q5
+#
+# You paint a step into the map. Must everything be asked again? `answers[i, j]` is what `ask` said
+# of the window `before[i : i + rows, j : j + columns]`, or 0 where that held an unknown cell (NaN).
+# The map is now `after`. Return the new answers, and again your work is counted: one call of `ask`,
+# with those windows only that hold a **changed** cell and no unknown one. A window with an unknown
+# cell has 0. `answers` belongs to the caller: leave it as it is.
+
+
+# %%
+def reassess(answers, before, after, rows, columns, ask):
+    """Return the answers for the map `after`, an array like `answers`."""
+    # BEGIN SOLUTION
+    changed = before != after
+    touched = np.lib.stride_tricks.sliding_window_view(changed, (rows, columns))
+    touched = touched.any(axis=(-2, -1))
+    view = np.lib.stride_tricks.sliding_window_view(after, (rows, columns))
+    windows = view.reshape(*view.shape[:2], rows * columns)
+    known = np.isfinite(windows).all(axis=-1)
+    updated = answers.copy()
+    updated[touched] = 0.0
+    asked = touched & known
+    if asked.any():
+        updated[asked] = ask(windows[asked])
+    return updated
+    # END SOLUTION
+
+
+# %%
+check("ex05.q5", reassess)
+
+# %% [markdown]
+# ## Your own planner
+#
+# What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
+# functions in place of the library's, and the picture says which stages are yours.
+
+# %%
+with_mine("ex05")
+
+# %% [markdown]
 # ## What to try
 #
-# - Check `first_layer` against `windows(...) @ kernel.ravel() + bias`, and time both on a map of
-#   300 x 300 cells with a kernel of 17 x 11.
+# - One cell of a map of 300 x 300 changes, and the window has 17 x 11 cells. Which share of all
+#   windows has to be asked?
 
 # %%
 solution("ex05.q4")

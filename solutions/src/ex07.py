@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Exercise 07 · Drive the plan
 #
-# **You will be able to** follow a route by pure pursuit, turn the shorter way, and switch policies
-# without flicker.
+# **You will be able to** follow a route by pure pursuit, turn towards an aim on the nearer side,
+# and switch policies without flicker.
 #
-# About 30 minutes. Needs notebook 07, numpy, and no GPU.
+# About 50 minutes. Needs notebook 07, numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex07.q1")` gives one more
 # hint at each call, and `solution("ex07.q1")` opens once the check has passed.
@@ -12,12 +12,12 @@
 # %%
 import numpy as np
 
-from fgtutor.course.checks import check, hint, solution
+from fgtutor.course.checks import check, hint, solution, with_mine
 
 # %% [markdown]
 # ## ex07.q1
 #
-# A follower steers for a point some way **ahead on the route**. Find the vertex of `route [n, 2]`
+# A follower steers for a point **ahead on the route**. Find the vertex of `route [n, 2]`
 # nearest to `position`; from there, go along the route until you have come at least `distance`
 # metres; return that vertex. If the route ends before, return its last one.
 #
@@ -46,8 +46,9 @@ hint("ex07.q1")
 # ## ex07.q2
 #
 # The robot faces `yaw` and wants to face `wanted`, both in radians, and both perhaps several turns
-# beyond $\pm\pi$. It turns at 3 rad/s for every radian of error, but at most at `limit` either way;
-# positive is to the left. And it turns **the shorter way**: from 179 to -179 degrees is 2 degrees.
+# beyond $\pm\pi$, and several turns apart. It turns at 3 rad/s for every radian of error, but at
+# most at `limit` either way; positive is to the left. And it turns **to the nearer side**: from 179
+# to -179 degrees is 2 degrees.
 
 
 # %%
@@ -65,9 +66,9 @@ check("ex07.q2", turn_rate)
 # %% [markdown]
 # ## ex07.q3
 #
-# Where two policies are about as good, the policy map flickers: 0 1 0 1. Each switch is a small
-# adventure for the robot, so a policy takes over only once it has been wanted for `hold` steps **in
-# a row**: in the step that completes the row. The first step runs `wanted[0]`.
+# Where two policies are about as good, the policy map flickers: 0 1 0 1. A switch is
+# a moment in which the robot may stumble, so a policy takes over only once it has been wanted for
+# `hold` steps **in a row**: in the step that completes the row. The first step runs `wanted[0]`.
 #
 # With wanted = 0 1 0 1 1 1 1 and hold = 3, the active policies are 0 0 0 0 0 1 1. Only the numbers
 # 0 and 1 occur.
@@ -89,6 +90,52 @@ def active_policies(wanted, hold):
 
 # %%
 check("ex07.q3", active_policies)
+
+# %% [markdown]
+# ## ex07.q4
+#
+# Put the parts together: a robot that follows a route. It is at `pose` = (x, y, yaw) and moves at
+# `speed`. In each step of `dt` seconds
+#
+# 1. it looks whether the route's last vertex is at most `near` metres away; if so, it stops;
+# 2. it finds its aim point, `distance` metres ahead on the route;
+# 3. it turns: the yaw changes by the turn rate of question 2 towards the aim, at most `limit`,
+#    times `dt`;
+# 4. it moves by `speed * dt` along the **new** yaw.
+#
+# After `most` steps it stops wherever it is. Return all its poses, the first one included.
+
+
+# %%
+def drive(route, pose, speed, distance, limit, near, dt, most):
+    """Return the poses (x, y, yaw) of the drive, [steps + 1, 3]."""
+    # BEGIN SOLUTION
+    poses = [np.array(pose, dtype=float)]
+    for _ in range(most):
+        x, y, yaw = poses[-1]
+        position = np.array([x, y])
+        if np.linalg.norm(route[-1] - position) <= near:
+            break
+        aim = aim_point(route, position, distance)
+        wanted = np.arctan2(aim[1] - y, aim[0] - x)
+        yaw = yaw + turn_rate(wanted, yaw, limit) * dt
+        x, y = x + speed * dt * np.cos(yaw), y + speed * dt * np.sin(yaw)
+        poses.append(np.array([x, y, yaw]))
+    return np.array(poses)
+    # END SOLUTION
+
+
+# %%
+check("ex07.q4", drive)
+
+# %% [markdown]
+# ## Your own planner
+#
+# What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
+# functions in place of the library's, and the picture says which stages are yours.
+
+# %%
+with_mine("ex07")
 
 # %% [markdown]
 # ## What to try

@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Exercise 08 · Meet the A1
 #
-# **You will be able to** turn actions into torques, tell which way is down from a quaternion,
-# mirror the robot, and add up its rewards.
+# **You will be able to** turn actions into torques, tell where down is from a quaternion,
+# mirror the robot, and watch a joint swing to its target.
 #
-# About 35 minutes. Needs notebook 08, numpy, and no GPU.
+# About 45 minutes. Needs notebook 08, numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex08.q1")` gives one more
 # hint at each call, and `solution("ex08.q1")` opens once the check has passed.
@@ -12,7 +12,7 @@
 # %%
 import numpy as np
 
-from fgtutor.course.checks import check, hint, solution
+from fgtutor.course.checks import check, hint, solution, with_mine
 
 # %% [markdown]
 # ## ex08.q1
@@ -20,10 +20,10 @@ from fgtutor.course.checks import check, hint, solution
 # The policy does not command torques. Its action moves the **target** of a spring and damper in
 # each joint: target = stance + 0.5 action (rad), and
 #
-# $$\tau = k_p (\text{target} - q) - k_d\, \dot q, \qquad k_p = 35 \text{ N m/rad}, \quad k_d = 0.5
-# \text{ N m s/rad},$$
+# $$\text{torque} = k_p (\text{target} - q) - k_d\, \dot q, \qquad k_p = 35 \text{ N m/rad}, \quad
+# k_d = 0.5 \text{ N m s/rad},$$
 #
-# at most 33.5 N m either way. So an action of zero stands, and a blow is answered within five
+# at most 33.5 N m either way. So an action of zero stands, and a push is answered within five
 # milliseconds, long before the policy hears of it.
 
 
@@ -45,7 +45,7 @@ hint("ex08.q1")
 # %% [markdown]
 # ## ex08.q2
 #
-# A policy should not need to know where north is, but it must know which way is down. So it
+# A policy should not need to know where north is, but it must know where down is. So it
 # observes the direction of gravity in the trunk's own frame: $R^\top (0, 0, -1)$, where $R$ turns
 # vectors of the trunk into the world. MuJoCo gives the posture as a quaternion $(w, x, y, z)$ of
 # length 1, and the third row of $R$ is
@@ -91,22 +91,50 @@ check("ex08.q3", mirrored)
 # %% [markdown]
 # ## ex08.q4
 #
-# A reward is a weighted sum of terms: tracking and gait earn, bouncing and jerking cost. Weights
-# are per second, a control step lasts `dt`. And the sum is floored at zero. Otherwise a robot for
-# which every step costs more than it earns would soon find out how to end the costs: by falling
-# over.
+# How fast is a joint where it should be, and how far does it swing beyond? A joint with `inertia`
+# (kg m^2) begins at rest at the angle 0, and its spring and damper pull it to `target` (rad,
+# positive). In each of `steps` steps of `dt` seconds
+#
+# 1. the torque is `kp * (target - q) - kd * dq`, at most `limit` either way;
+# 2. the speed `dq` changes by torque / inertia, times `dt`;
+# 3. the angle `q` changes by the **new** speed, times `dt`. (With the old speed the swing would
+#    gain energy from nothing.)
+#
+# Return the angles after each step; the overshoot, which is how far beyond the target the largest
+# angle lies (0 if never); and the settling time. The joint has settled at the end of the first step
+# from which on it stays within 5 % of the target. If it is not there at the end: NaN.
 
 
 # %%
-def reward(terms, weights, dt):
-    """Return the reward of every robot in this step, [n]; terms is [n, k], weights [k]."""
+def step_response(target, inertia, kp, kd, limit, dt, steps):
+    """Return (angles [steps], overshoot in rad, settling time in s)."""
     # BEGIN SOLUTION
-    return np.maximum(terms @ weights, 0.0) * dt
+    angles, q, dq = np.zeros(steps), 0.0, 0.0
+    for i in range(steps):
+        torque = np.clip(kp * (target - q) - kd * dq, -limit, limit)
+        dq += torque / inertia * dt
+        q += dq * dt
+        angles[i] = q
+    overshoot = max(angles.max() - target, 0.0)
+    outside = np.flatnonzero(np.abs(angles - target) > 0.05 * target)
+    settled = outside[-1] + 1 if len(outside) else 0
+    if settled == steps:
+        return angles, overshoot, np.nan
+    return angles, overshoot, (settled + 1) * dt
     # END SOLUTION
 
 
 # %%
-check("ex08.q4", reward)
+check("ex08.q4", step_response)
+
+# %% [markdown]
+# ## Your own planner
+#
+# What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
+# functions in place of the library's, and the picture says which stages are yours.
+
+# %%
+with_mine("ex08")
 
 # %% [markdown]
 # ## What to try

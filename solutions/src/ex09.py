@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Exercise 09 · Train a specialist
 #
-# **You will be able to** move robots through a curriculum, estimate advantages, and explain why the
-# learning rate in the log goes up and down.
+# **You will be able to** move robots through a curriculum, estimate advantages over falls and
+# time-outs, and explain why the learning rate in the log goes up and down.
 #
-# About 30 minutes. Needs notebook 09, numpy, and no GPU.
+# About 45 minutes. Needs notebook 09, numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex09.q1")` gives one more
 # hint at each call, and `solution("ex09.q1")` opens once the check has passed.
@@ -12,15 +12,16 @@
 # %%
 import numpy as np
 
-from fgtutor.course.checks import check, hint, solution
+from fgtutor.course.checks import check, hint, solution, with_mine
 
 # %% [markdown]
 # ## ex09.q1
 #
-# Nobody learns on a cliff. The training world has rows of growing difficulty, 0 to `last`. After an
-# episode, a robot moves one row **up** if its mean $r_v$ was above 0.5 and it did not fall, one row
-# **down** if its mean $r_v$ was below 0.3 or it fell, and else it stays. Nobody leaves the world.
-# (The thresholds are the toy's, and the rule a little simpler than the one of notebook 09.)
+# A beginner learns nothing on a cliff. The training world has rows of growing difficulty, 0 to
+# `last`. After an episode, a robot moves one row **up** if its mean $r_v$ was above 0.5 and it did
+# not fall, one row **down** if its mean $r_v$ was below 0.3 or it fell, and otherwise it stays. No
+# robot leaves the world. (The thresholds are the toy's, and the rule a little simpler than the one
+# of notebook 09.)
 
 
 # %%
@@ -44,7 +45,7 @@ hint("ex09.q1")
 #
 # Was an action better than expected? The critic expects $V_t$; what came is $r_t$ and a state worth
 # $V_{t+1}$. The surprise of one step is $\delta_t = r_t + \gamma V_{t+1} - V_t$, and generalised
-# advantage estimation adds up the later surprises, each $\gamma\lambda$ times fainter:
+# advantage estimation adds up the later surprises, each $\gamma\lambda$ times less:
 #
 # $$A_t = \delta_t + \gamma\lambda A_{t+1}.$$
 #
@@ -73,8 +74,8 @@ check("ex09.q2", advantages)
 # %% [markdown]
 # ## ex09.q3
 #
-# How long may a step of learning be? rsl_rl watches how far the policy has moved, by the KL
-# divergence between old and new: if `kl` is above twice the `desired` one, the learning rate is
+# By how much may one update change the policy? rsl_rl watches how far the policy has moved, by the
+# KL divergence between old and new: if `kl` is above twice the `desired` one, the learning rate is
 # divided by 1.5; if it is below half of it, multiplied by 1.5; else it stays. It never leaves
 # $10^{-5} \ldots 10^{-2}$. All are single numbers.
 
@@ -93,6 +94,53 @@ def next_rate(rate, kl, desired):
 
 # %%
 check("ex09.q3", next_rate)
+
+# %% [markdown]
+# ## ex09.q4
+#
+# In training the rollout is a table `[T, n]`, and episodes end in two ways. A robot that **fell**
+# earns nothing more: its future is worth 0. A robot whose time is up could have gone on: its future
+# is worth what the critic says of the state in which it was stopped. `next_values[t]` holds this
+# value of the state that step $t$ led to, before any reset. So
+#
+# $$\delta_t = r_t + \gamma\,(1 - \text{fell}_t)\,V^{next}_t - V_t,$$
+#
+# and $A_t = \delta_t + \gamma\lambda A_{t+1}$, but nothing is carried back over an end of either
+# kind.
+#
+# PPO then **normalises** the advantages: over the whole table, mean 0 and standard deviation 1
+# (`np.std`).
+
+
+# %%
+def batch_advantages(rewards, values, next_values, fell, timed_out, gamma, lam):
+    """Return the normalised advantages [T, n]; all tables are [T, n]."""
+    # BEGIN SOLUTION
+    ended = fell | timed_out
+    table = np.zeros(rewards.shape)
+    carried = np.zeros(rewards.shape[1])
+    for t in reversed(range(len(rewards))):
+        future = np.where(fell[t], 0.0, next_values[t])
+        delta = rewards[t] + gamma * future - values[t]
+        carried = np.where(ended[t], 0.0, carried)
+        carried = delta + gamma * lam * carried
+        table[t] = carried
+    centred = table - table.mean()
+    return centred / table.std()
+    # END SOLUTION
+
+
+# %%
+check("ex09.q4", batch_advantages)
+
+# %% [markdown]
+# ## Your own planner
+#
+# What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
+# functions in place of the library's, and the picture says which stages are yours.
+
+# %%
+with_mine("ex09")
 
 # %% [markdown]
 # ## What to try

@@ -11,7 +11,7 @@
 # %%
 import numpy as np
 
-from fgtutor.course.checks import check, hint, solution
+from fgtutor.course.checks import check, hint, solution, with_mine
 
 # %% [markdown]
 # ## ex10.q1
@@ -36,12 +36,12 @@ hint("ex10.q1")
 # %% [markdown]
 # ## ex10.q2
 #
-# A planner that always arrives, by way of the moon, has a success rate of 100 %. SPL (Anderson et
-# al., 2018) weighs each success by how direct the way was:
+# A planner that always arrives, after any detour, has a success rate of 100 %. SPL (Anderson et
+# al., 2018) weighs each success by how direct the walk was:
 #
 # $$\mathrm{SPL} = \frac1N \sum_i S_i\, \frac{\ell_i}{\max(p_i, \ell_i)},$$
 #
-# $S$ = success, $p$ = length of the walk, $\ell$ = length of a reference way. A failure counts 0,
+# $S$ = success, $p$ = length of the walk, $\ell$ = length of a reference route. A failure counts 0,
 # and a walk shorter than its reference counts 1, not more.
 
 
@@ -59,7 +59,7 @@ check("ex10.q2", spl)
 # %% [markdown]
 # ## ex10.q3
 #
-# A judgement, with a number. This is the paper's Table I, for one start and goal:
+# A judgement, with a number and a reason. This is the paper's Table I, for one start and goal:
 #
 # | | epoch 1.5K | epoch 5K | epoch 20K |
 # |---|---|---|---|
@@ -68,7 +68,7 @@ check("ex10.q2", spl)
 # | SPL | 0.19 | 0.34 | 0.51 |
 #
 # The paper does not say which reference length its SPL uses. The table does. How long is it, in
-# metres? (2 % off is close enough.)
+# metres? (2 % off is close enough.) And which line through the world is that likely to be?
 
 # %%
 # BEGIN SOLUTION
@@ -80,6 +80,18 @@ reference_length = (26.75 * 0.19 + 14.84 * 0.34 + 9.73 * 0.51) / 3
 
 # %%
 check("ex10.q3", reference_length)
+
+# %% [markdown]
+# *Why? Two or three sentences, for a teacher to read:*
+
+# %% [markdown]
+# ## Your own planner
+#
+# What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
+# functions in place of the library's, and the picture says which stages are yours.
+
+# %%
+with_mine("ex10")
 
 # %% [markdown]
 # ## What to try

@@ -1,5 +1,7 @@
 """Exercise 01, "Elevation maps and patches": cells, ground, headings, directions (Sec. III-B)."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from fgtutor.course.checks.question import Mistake, Question
@@ -15,11 +17,49 @@ def _points(rng: np.random.Generator) -> tuple:
     return origin + (cells + rng.uniform(0.15, 0.85, (8, 2))) * resolution, origin, resolution
 
 
-def _patch(rng: np.random.Generator) -> tuple:
-    patch = rng.uniform(-2, 2) + rng.exponential(0.2, (7, 5))
-    footprint = np.zeros((7, 5), dtype=bool)
-    footprint[2:5, 1:4] = True
-    return patch, footprint
+def _map_and_pose(rng: np.random.Generator) -> tuple:
+    heights = rng.uniform(-1, 1) + rng.exponential(0.2, (12, 10))
+    origin, resolution = rng.uniform(-3, 3, 2), 0.1
+    pose = np.array([*(origin + rng.uniform(0.4, 0.6, 2)), rng.uniform(-3, 3)])
+    offsets = np.array(
+        [(x, y) for x in (-0.13, 0.02, 0.14, 0.3, 0.95) for y in (-0.11, 0.03, 0.12)]
+    )
+    return heights, origin, resolution, pose, offsets, offsets[:, 0] < 0.2
+
+
+def _cut(
+    heights: np.ndarray,
+    origin: np.ndarray,
+    resolution: float,
+    pose: np.ndarray,
+    offsets: np.ndarray,
+    under: np.ndarray,
+    *,
+    nearest: bool = False,
+    shift: float = 0.5,
+    clamp: bool = False,
+    ground: Callable[[np.ndarray], float] | None = np.median,
+    under_only: bool = True,
+    blank: bool = False,
+) -> np.ndarray:
+    """Return the patch, point by point; the options make it wrong."""
+    patch = []
+    for u, v in (_turned(offsets, pose) - origin) / resolution - shift:
+        if nearest:
+            u, v = round(u), round(v)
+        corners = [(int(u // 1) + i, int(v // 1) + j) for i in (0, 1) for j in (0, 1)]
+        shares = [abs((1 - i - u % 1) * (1 - j - v % 1)) for i in (0, 1) for j in (0, 1)]
+        if clamp:
+            corners = [tuple(np.clip(c, 0, np.array(heights.shape) - 1)) for c in corners]
+        inside = [0 <= x < heights.shape[0] and 0 <= y < heights.shape[1] for x, y in corners]
+        pairs = zip(corners, shares, strict=True)
+        patch.append(sum(heights[c] * s for c, s in pairs) if all(inside) else np.nan)
+    cut = np.array(patch)
+    if ground is None:
+        return cut
+    if blank:
+        return cut - np.nanmedian(cut * under)
+    return cut - (ground(cut[under]) if under_only else np.nanmedian(cut))
 
 
 def _turned(offsets: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -38,16 +78,17 @@ QUESTIONS = (
     Question(
         id="ex01.q1",
         name="cells_of",
-        points=2,
+        points=1,
         title="which cell holds a point?",
         expects="a point is in cell (ix, iy) if ix * resolution <= x - x0 < (ix + 1) * resolution, "
         "and so for y; left of the map, indices are negative.",
         draw=_points,
+        integers=True,
         truth=lambda xy, origin, resolution: np.floor((xy - origin) / resolution).astype(int),
         mistakes=(
             Mistake(
-                "rounding for floor: the origin is a cell's corner, not its centre, so no cell "
-                "begins half a cell early.",
+                "rounding to the nearest: the origin is a cell's corner, not its centre, so round "
+                "down.",
                 lambda xy, o, r: np.round((xy - o) / r).astype(int),
             ),
             Mistake(
@@ -59,12 +100,13 @@ QUESTIONS = (
                 lambda xy, o, r: np.floor((xy - o) / r).astype(int)[:, ::-1],
             ),
             Mistake(
-                "truncation for floor: int() cuts towards zero, so points just left of the map "
-                "land in cell 0.",
+                "int() where np.floor is needed: int() cuts towards zero, so points just left of "
+                "the map land in cell 0.",
                 lambda xy, o, r: ((xy - o) / r).astype(int),
             ),
             Mistake(
-                "a product for a quotient: metres divided by metres per cell gives cells.",
+                "a multiplication by the resolution: metres divided by metres per cell gives "
+                "cells.",
                 lambda xy, o, r: np.floor((xy - o) * r).astype(int),
             ),
         ),
@@ -76,47 +118,8 @@ QUESTIONS = (
     ),
     Question(
         id="ex01.q2",
-        name="relative_patch",
-        points=2,
-        title="heights relative to the ground",
-        expects="the median of the cells under the footprint is 0 after the subtraction, and "
-        "height differences within the patch are unchanged.",
-        draw=_patch,
-        truth=lambda patch, footprint: patch - np.median(patch[footprint]),
-        mistakes=(
-            Mistake(
-                "mean for median: one high cell under a foot would lift the whole ground.",
-                lambda patch, under: patch - patch[under].mean(),
-            ),
-            Mistake(
-                "the whole patch for the footprint: a wall ahead is no ground: only cells under "
-                "the robot count.",
-                lambda patch, under: patch - np.median(patch),
-            ),
-            Mistake(
-                "the middle cell alone: a single cell may be a stone: take the median under the "
-                "footprint.",
-                lambda patch, under: patch - patch[3, 2],
-            ),
-            Mistake(
-                "the lowest cell for the median: the ground is the median height under the robot.",
-                lambda patch, under: patch - patch[under].min(),
-            ),
-            Mistake(
-                "absolute heights: nothing was subtracted: the same step looks different on every "
-                "floor.",
-                lambda patch, under: patch,
-            ),
-        ),
-        hints=(
-            "footprint is a mask: patch[footprint] are the heights under the robot.",
-            "np.median, not np.mean.",
-        ),
-    ),
-    Question(
-        id="ex01.q3",
         name="patch_points",
-        points=3,
+        points=2,
         title="where the points of a patch lie",
         expects="offsets (ahead, left) are turned counter-clockwise by the yaw, then moved to the "
         "robot: at yaw 90 degrees, ahead is +y and left is -x.",
@@ -144,7 +147,7 @@ QUESTIONS = (
                 lambda offsets, pose: _turned(offsets + pose[:2], pose * (0, 0, 1)),
             ),
             Mistake(
-                "radians taken for degrees: the yaw is in radians already.",
+                "a yaw converted from degrees: it is in radians already.",
                 lambda offsets, pose: _turned(offsets, pose * (1, 1, np.pi / 180)),
             ),
         ),
@@ -155,9 +158,72 @@ QUESTIONS = (
         ),
     ),
     Question(
+        id="ex01.q3",
+        name="cut_patch",
+        points=3,
+        title="cut a patch out of a map",
+        expects="each height is bilinear between the four cell CENTRES around its point, NaN if "
+        "one of the four is off the map, and relative to the median of the points under the robot.",
+        draw=_map_and_pose,
+        truth=lambda heights, origin, resolution, pose, offsets, under: _cut(
+            heights, origin, resolution, pose, offsets, under
+        ),
+        mistakes=(
+            Mistake(
+                "the cell's own height: a point between two centres has a height between theirs.",
+                lambda *case: _cut(*case, nearest=True),
+            ),
+            Mistake(
+                "corners taken for centres: cell (0, 0) has its height at origin + resolution / 2, "
+                "so half a cell has to come off.",
+                lambda *case: _cut(*case, shift=0.0),
+            ),
+            Mistake(
+                "indices that wrap or stop at the border: off the map nothing is known: NaN.",
+                lambda *case: _cut(*case, clamp=True),
+            ),
+            Mistake(
+                "zeros off the map: that reads as flat ground; what is not known is NaN.",
+                lambda *case: np.nan_to_num(_cut(*case)),
+            ),
+            Mistake(
+                "absolute heights: nothing was subtracted, so the same step looks different on "
+                "every floor.",
+                lambda *case: _cut(*case, ground=None),
+            ),
+            Mistake(
+                "the mean of the ground: one stone under a foot would lift the whole patch; take "
+                "the median.",
+                lambda *case: _cut(*case, ground=np.mean),
+            ),
+            Mistake(
+                "the ground of the whole patch: a wall ahead is no ground; only the points under "
+                "the robot count.",
+                lambda *case: _cut(*case, under_only=False),
+            ),
+            Mistake(
+                "heights blanked instead of selected: heights * mask puts zeros into the median; "
+                "select them with heights[under].",
+                lambda *case: _cut(*case, blank=True),
+            ),
+            Mistake(
+                "a map seen from the wrong side: the points are not turned by the yaw.",
+                lambda h, o, r, pose, offsets, u: _cut(h, o, r, pose * (1, 1, 0), offsets, u),
+            ),
+        ),
+        hints=(
+            "Where do the points lie in the world? patch_points says it. And in cells, counted "
+            "from the centre of cell (0, 0)?",
+            "low = np.floor(cells); the fractions cells - low are the weights of the upper "
+            "neighbours, 1 minus them those of the lower ones.",
+            "Four neighbours: low + (0, 0), (0, 1), (1, 0), (1, 1). Start each from an array of "
+            "NaN, and fill in only those that are inside the map.",
+        ),
+    ),
+    Question(
         id="ex01.q4",
         name="rise",
-        points=2,
+        points=1,
         title="up or down depends on the heading",
         expects="rise[ix, iy] is the height of the neighbour along the heading minus the height of "
         "the cell itself, and NaN where that neighbour is off the map.",

@@ -1,4 +1,4 @@
-"""Exercise 02, "A robot that falls": r_v, labels, returns and the PPO objective (Sec. III-A)."""
+"""Exercise 02, "A robot that falls": r_v, labels, returns, PPO, episodes (Sec. III-A)."""
 
 import numpy as np
 
@@ -16,6 +16,48 @@ def _episode(rng: np.random.Generator) -> tuple:
     steps = int(rng.integers(10, 16))
     fell = np.arange(steps) >= rng.integers(4, 8)
     return rng.uniform(0.2, 1, steps), fell, int(rng.integers(3, 6))
+
+
+def _runs(rng: np.random.Generator) -> tuple:
+    steps, robots = 14, 4
+    rewards = rng.uniform(0, 1, (steps, robots))
+    fell, timed_out = np.zeros((2, steps, robots), dtype=bool)
+    fell[rng.integers(2, 5), 0] = fell[rng.integers(6, 9), 0] = True  # falls twice
+    timed_out[steps - 1, 1] = True  # ends with the rollout
+    timed_out[rng.integers(3, 6), 2] = True  # and an episode that goes on
+    return rewards, fell, timed_out
+
+
+def _statistics(
+    rewards: np.ndarray, fell: np.ndarray, timed_out: np.ndarray, unfinished: bool = False
+) -> tuple[float, float, float]:
+    """Cut the steps of each robot behind every end, and look at the pieces."""
+    returns, falls, lengths = [], [], []
+    for robot in range(rewards.shape[1]):
+        ends = np.flatnonzero(fell[:, robot] | timed_out[:, robot])
+        pieces = np.split(np.arange(len(rewards)), ends + 1)
+        for piece in pieces if unfinished else pieces[:-1]:
+            if len(piece):
+                returns.append(rewards[piece, robot].sum())
+                falls.append(fell[piece[-1], robot])
+                lengths.append(len(piece))
+    if not lengths:
+        return np.nan, np.nan, np.nan
+    return float(np.mean(returns)), float(np.mean(falls)), float(np.mean(lengths))
+
+
+def _in_one_row(
+    rewards: np.ndarray, fell: np.ndarray, timed_out: np.ndarray
+) -> tuple[float, float, float]:
+    rewards, fell, timed_out = (table.T.reshape(-1, 1) for table in (rewards, fell, timed_out))
+    return _statistics(rewards, fell, timed_out)
+
+
+def _per_step(
+    rewards: np.ndarray, fell: np.ndarray, timed_out: np.ndarray
+) -> tuple[float, float, float]:
+    mean, falls, length = _statistics(rewards, fell, timed_out)
+    return mean / length, falls, length
 
 
 def _labels(r_v: np.ndarray, fell: np.ndarray, window: int, first: int = 0) -> np.ndarray:
@@ -53,10 +95,10 @@ QUESTIONS = (
     Question(
         id="ex02.q1",
         name="tracking_reward",
-        points=3,
+        points=1,
         title="the tracking reward r_v",
-        expects="r_v = exp(-||v - v_cmd|| / 0.25): 1 when the command is met, 1/e when the "
-        "velocity is 0.25 m/s off in any direction.",
+        expects="r_v is 1 where the command is met, and falls to 1/e where the velocity is "
+        "0.25 m/s off in any direction; one number per robot.",
         draw=_velocities,
         examples=((np.array([[0.5, 0.0], [0.5, 0.25]]), np.array([[0.5, 0.0], [0.5, 0.0]])),),
         truth=lambda velocity, command: np.exp(-np.hypot(*(velocity - command).T) / SIGMA),
@@ -98,11 +140,13 @@ QUESTIONS = (
     Question(
         id="ex02.q2",
         name="labels",
-        points=2,
+        points=1,
         title="what the Feasibility-Net is taught",
         expects="the label of step t is the mean of r_v over steps t ... t + window - 1 (fewer at "
         "the end of the rollout), in which every step of a fallen robot counts as 0.",
         draw=_episode,
+        # No fall, so the last labels are means over fewer steps.
+        examples=((np.linspace(0.3, 1.0, 8), np.zeros(8, dtype=bool), 3),),
         truth=lambda r_v, fell, window: _labels(r_v, fell, window),
         mistakes=(
             Mistake(
@@ -120,7 +164,7 @@ QUESTIONS = (
                 lambda r_v, fell, window: _labels(r_v, fell, window, first=1 - window),
             ),
             Mistake(
-                "sum for mean: a label lies in [0, 1].",
+                "a sum over the window: a label is a mean, and lies in [0, 1].",
                 lambda r_v, fell, window: np.array(
                     [np.where(fell, 0, r_v)[t : t + window].sum() for t in range(len(r_v))]
                 ),
@@ -138,10 +182,10 @@ QUESTIONS = (
     Question(
         id="ex02.q3",
         name="discounted_returns",
-        points=2,
+        points=1,
         title="what a step was worth",
-        expects="G_t = r_t + gamma * G_(t+1) within an episode; the step where done is True is its "
-        "last, so there G_t = r_t.",
+        expects="a reward counts gamma times less for every step that it lies ahead, and nothing "
+        "is carried back over the step where done is True.",
         draw=_rewards,
         truth=_returns,
         mistakes=(
@@ -177,10 +221,10 @@ QUESTIONS = (
     Question(
         id="ex02.q4",
         name="clipped_objective",
-        points=2,
+        points=1,
         title="PPO's objective",
-        expects="the mean over samples of min(ratio * A, clip(ratio, 1 - eps, 1 + eps) * A): no "
-        "gain from moving further than eps, but every loss is felt.",
+        expects="a mean over the samples: no gain from moving the ratio further than epsilon from "
+        "1, but every loss is felt.",
         draw=_ratios,
         truth=lambda ratio, advantage, epsilon: np.mean(
             np.where(
@@ -191,7 +235,8 @@ QUESTIONS = (
         ),
         mistakes=(
             Mistake(
-                "max for min: the bound must be pessimistic: the smaller of the two counts.",
+                "the larger of the two: the bound must be pessimistic: the smaller of the two "
+                "counts.",
                 lambda r, a, e: np.maximum(r * a, np.clip(r, 1 - e, 1 + e) * a).mean(),
             ),
             Mistake(
@@ -204,18 +249,65 @@ QUESTIONS = (
                 lambda r, a, e: (np.clip(r, 1 - e, 1 + e) * a).mean(),
             ),
             Mistake(
-                "sum for mean: the objective must not grow with the batch.",
+                "a sum over the samples: the objective is a mean; it must not grow with the batch.",
                 lambda r, a, e: np.minimum(r * a, np.clip(r, 1 - e, 1 + e) * a).sum(),
             ),
             Mistake(
-                "a loss for an objective: the sign is turned: the objective is what PPO makes "
-                "large.",
+                "a loss in place of an objective: the sign is turned: the objective is what PPO "
+                "makes large.",
                 lambda r, a, e: -np.minimum(r * a, np.clip(r, 1 - e, 1 + e) * a).mean(),
             ),
         ),
         hints=(
             "Compute both products for every sample, then take the smaller one.",
             "np.minimum(ratio * advantage, np.clip(...) * advantage).mean()",
+        ),
+    ),
+    Question(
+        id="ex02.q5",
+        name="episode_statistics",
+        points=3,
+        title="a point of the learning curve",
+        expects="over all episodes that ended (by a fall or a time-out), of all robots: the mean "
+        "sum of rewards, the share that ended by a fall, and the mean number of steps; NaN three "
+        "times if none ended.",
+        draw=_runs,
+        examples=((np.ones((3, 2)), np.zeros((3, 2), dtype=bool), np.zeros((3, 2), dtype=bool)),),
+        truth=lambda rewards, fell, timed_out: _statistics(rewards, fell, timed_out),
+        mistakes=(
+            Mistake(
+                "episodes that have not ended: the last one of a robot may still be going on; it "
+                "would look shorter and poorer than it will be.",
+                lambda r, f, t: _statistics(r, f, t, unfinished=True),
+            ),
+            Mistake(
+                "time-outs overlooked: an episode ends by a fall or by a time-out.",
+                lambda r, f, t: _statistics(r, f, t & False),
+            ),
+            Mistake(
+                "time-outs counted as falls: a robot that was still upright when time ran out did "
+                "not fall.",
+                lambda r, f, t: _statistics(r, f | t, t),
+            ),
+            Mistake(
+                "episodes that run on into the next robot: every column is a robot of its own.",
+                _in_one_row,
+            ),
+            Mistake(
+                "reward per step: the return of an episode is the SUM of its rewards.",
+                _per_step,
+            ),
+            Mistake(
+                "zeros for no episode: 0 would say that all of them earned nothing; where none "
+                "ended, answer NaN.",
+                lambda r, f, t: tuple(np.nan_to_num(_statistics(r, f, t))),
+            ),
+        ),
+        hints=(
+            "Two loops: over the robots, and over the steps of one robot. Carry along what the "
+            "current episode has earned and how long it has lasted.",
+            "At an end, write both down and start again from zero. What is still being carried "
+            "after the last step belongs to an episode that has not ended.",
         ),
     ),
 )

@@ -14,7 +14,9 @@ def _patches(rng: np.random.Generator) -> tuple:
 def _losses(rng: np.random.Generator) -> tuple:
     low = float(rng.uniform(0.05, 0.5))
     high = low + float(rng.uniform(0.5, 3.0))
-    return rng.uniform(0, high + 1, (4, 5)), low, high
+    loss = rng.uniform(0, high + 1, (4, 5))
+    loss[0, :4] = 0.5 * low, low, high, high + 1.0
+    return loss, low, high
 
 
 def _weight(loss: np.ndarray, tau_low: float, tau_high: float) -> np.ndarray:
@@ -32,6 +34,11 @@ def _share_beyond(losses: np.ndarray, own: np.ndarray) -> np.ndarray:
     return 1 - np.searchsorted(np.sort(own), losses) / len(own)
 
 
+def _interpolated(losses: np.ndarray, own: np.ndarray, alpha: float) -> np.ndarray:
+    levels = 1 - np.arange(len(own)) / len(own)
+    return np.minimum(np.interp(losses, np.sort(own), levels, right=0.0) / alpha, 1.0)
+
+
 def _ceiling(f: float, f_min: float) -> float:
     return 0.1 + 1.9 * (1 - f_min / f)
 
@@ -40,7 +47,7 @@ QUESTIONS = (
     Question(
         id="ex04.q1",
         name="reconstruction_loss",
-        points=2,
+        points=1,
         title="L_recon of a patch",
         expects="L_recon is one number per patch: the SUM over its points of the squared error, in "
         "the scaled units that the VAE sees (height_scale * metres).",
@@ -50,8 +57,8 @@ QUESTIONS = (
         ),
         mistakes=(
             Mistake(
-                "mean for sum: the errors are averaged over the points, so tau = 0.1 and 2.0 lose "
-                "their meaning.",
+                "a mean over the points: the errors are averaged over the points, so tau = 0.1 and "
+                "2.0 lose their meaning.",
                 lambda x, y, s: ((s * x - y) ** 2).mean(axis=-1),
             ),
             Mistake(
@@ -70,7 +77,7 @@ QUESTIONS = (
                 lambda x, y, s: ((s * x - y) ** 2).sum(),
             ),
             Mistake(
-                "absolute for squared errors: the errors are not squared.",
+                "absolute errors: the errors are not squared.",
                 lambda x, y, s: np.abs(s * x - y).sum(axis=-1),
             ),
             Mistake(
@@ -88,7 +95,7 @@ QUESTIONS = (
     Question(
         id="ex04.q2",
         name="ood_weight",
-        points=3,
+        points=1,
         title="the weight w_ood",
         expects="w_ood is 1 up to tau_low, 0 from tau_high on, and falls linearly between.",
         draw=_losses,
@@ -128,7 +135,7 @@ QUESTIONS = (
     Question(
         id="ex04.q3",
         name="conformal_weight",
-        points=2,
+        points=1,
         title="a weight that means the same in every network",
         expects="p is the share of the own losses that are at least as large as the loss; the "
         "weight is p / alpha, and never above 1.",
@@ -155,10 +162,22 @@ QUESTIONS = (
                 lambda losses, own, alpha: _share_beyond(losses, own) / alpha,
             ),
             Mistake(
-                "a count for a share: divide the number of own losses beyond by how many there "
-                "are (or take the mean).",
+                "a count in place of a share: divide the number of own losses beyond by how many "
+                "there are (or take the mean).",
                 lambda losses, own, alpha: np.minimum(
                     len(own) * _share_beyond(losses, own) / alpha, 1.0
+                ),
+            ),
+            Mistake(
+                "a share that is interpolated between own losses: p is a count divided by the "
+                "number of own losses, so it is a step function of the loss.",
+                _interpolated,
+            ),
+            Mistake(
+                "a rank that starts at 1: count the own losses that are at least as large; the "
+                "loss itself is not one of them.",
+                lambda losses, own, alpha: np.minimum(
+                    (_share_beyond(losses, own) * len(own) + 1) / (len(own) + 1) / alpha, 1.0
                 ),
             ),
             Mistake(
@@ -179,8 +198,8 @@ QUESTIONS = (
         name="largest_loss",
         points=2,
         title="when does a good place close?",
-        expects="the L_recon at which F = w_ood * f has fallen to f_min = 0.1, where f = 0.9 and "
-        "the taus are the paper's 0.1 and 2.0.",
+        expects="the L_recon from which on F lies below f_min = 0.1 although f = 0.9, with the "
+        "paper's taus, 0.1 and 2.0.",
         truth=lambda: _ceiling(0.9, 0.1),
         mistakes=(
             Mistake(

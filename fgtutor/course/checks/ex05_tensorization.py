@@ -1,19 +1,143 @@
 """Exercise 05, "From map to tensor": windows, convolution, headings, L_recon (Sec. III-B)."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from fgtutor.course.checks.question import Mistake, Question
 
 
-def _map_and_window(rng: np.random.Generator) -> tuple:
-    shape = (int(rng.integers(6, 9)), int(rng.integers(5, 8)))
-    return rng.normal(0, 1, shape), 3, 2
+def _map_with_gap(rng: np.random.Generator) -> tuple:
+    heights = rng.normal(0, 1, (int(rng.integers(7, 9)), int(rng.integers(6, 8))))
+    heights[rng.integers(2, 5), rng.integers(2, 4)] = np.nan
+    return heights, 3, 3, rng.normal(0, 0.5, 9)
 
 
-def _windows(heights: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    windows = sliding_window_view(heights, (rows, columns))
-    return windows.reshape(*windows.shape[:2], rows * columns)
+def tensor_answers(
+    target: "Any", heights: "np.ndarray", rows: int, columns: int, weights: "np.ndarray"
+) -> tuple:
+    """Return the learner's tensor, whether four calls were enough, and the windows asked."""
+    import numpy as np
+
+    calls = []
+
+    def ask(windows: np.ndarray) -> np.ndarray:
+        windows = np.asarray(windows)
+        if windows.ndim != 2 or windows.shape[1] != len(weights):
+            raise ValueError(f"ask takes windows [n, {len(weights)}], got {windows.shape}")
+        calls.append(len(windows))
+        return 1 / (1 + np.exp(-(windows @ weights)))
+
+    tensor = target(heights, rows, columns, ask)
+    return tensor, len(calls) <= 4, sum(calls)
+
+
+def _tensorize(
+    heights: np.ndarray,
+    rows: int,
+    columns: int,
+    ask: Callable[[np.ndarray], np.ndarray],
+    *,
+    single: bool = False,
+    twice: bool = False,
+    unknown: bool = False,
+    relative: bool = True,
+    headings: tuple[int, ...] = (0, 1, 2, 3),
+    mirrored: bool = False,
+    back: int = 0,
+) -> np.ndarray:
+    """Gather each window cell by cell, from where the robot stands; the options make it wrong."""
+    tensor, places, windows = np.zeros((*heights.shape, 4)), [], []
+    for k, heading in enumerate(headings):
+        ahead = np.array(((1, 0), (0, 1), (-1, 0), (0, -1))[heading])
+        left = np.array((-ahead[1], ahead[0])) * (-1 if mirrored else 1)
+        inner = [(i - back, j - columns // 2) for i in range(rows) for j in range(columns)]
+        for cell in np.ndindex(heights.shape):
+            cells = np.array([cell + i * ahead + j * left for i, j in inner])
+            if (cells >= 0).all() and (cells < heights.shape).all():
+                window = heights[cells[:, 0], cells[:, 1]] - (heights[cell] if relative else 0)
+                if unknown or np.isfinite(window).all():
+                    places.append((*cell, k))
+                    windows.append(window)
+    scores = _asked(windows, ask, single)
+    if twice:
+        ask(np.array(windows))
+    tensor[tuple(np.array(places).T)] = np.nan_to_num(scores)
+    return tensor
+
+
+def _asked(windows: list, ask: Callable[[np.ndarray], np.ndarray], single: bool) -> np.ndarray:
+    batches = np.array(windows)[:, None] if single else np.array(windows)[None]
+    return np.concatenate([ask(batch) for batch in batches])
+
+
+def _stroke(rng: np.random.Generator) -> tuple:
+    before = rng.normal(0, 1, (9, 8))
+    before[0, 0] = before[7, 6] = np.nan
+    after = before.copy()
+    x, y = rng.integers(3, 5, 2)
+    after[x : x + 2, y] += 1.0
+    after[x, y - 1] = np.nan  # seen before, unknown now
+    after[7, 6] = 0.0  # unknown before, seen now
+    return before, after, 3, 2, rng.normal(0, 0.5, 6)
+
+
+def update_answers(
+    target: "Any",
+    before: "np.ndarray",
+    after: "np.ndarray",
+    rows: int,
+    columns: int,
+    weights: "np.ndarray",
+) -> tuple:
+    """Return the learner's new answers, the windows asked, the calls, and if the old ones stand."""
+    import numpy as np
+
+    asked = []
+
+    def ask(windows: np.ndarray) -> np.ndarray:
+        asked.append(len(windows))
+        return 1 / (1 + np.exp(-(np.asarray(windows) @ weights)))
+
+    views = np.lib.stride_tricks.sliding_window_view(before, (rows, columns))
+    old = np.nan_to_num(ask(views.reshape(*views.shape[:2], -1)))
+    asked.clear()
+    given = old.copy()
+    new = np.array(target(given, before, after, rows, columns, ask))
+    return new, sum(asked), len(asked), bool((given == old).all())
+
+
+def _reassess(
+    answers: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+    rows: int,
+    columns: int,
+    ask: Callable[[np.ndarray], np.ndarray],
+    *,
+    everything: bool = False,
+    corner: bool = False,
+    stale: bool = False,
+    shown: np.ndarray | None = None,
+    single: bool = False,
+    in_place: bool = False,
+) -> np.ndarray:
+    """Look at each window in turn; the options make it wrong."""
+    new, places, windows = answers if in_place else answers.copy(), [], []
+    for i, j in np.ndindex(answers.shape):
+        cut = np.s_[i : i + rows, j : j + columns]
+        changed = (before[cut] != after[cut]).ravel()
+        if not (everything or changed[: 1 if corner else None].any()):
+            continue
+        if not np.isnan(after[cut]).any():
+            places.append((i, j))
+            windows.append((after if shown is None else shown)[cut].ravel())
+        elif not stale:
+            new[i, j] = 0.0
+    new[tuple(np.array(places).T)] = _asked(windows, ask, single)
+    return new
 
 
 def _layer_inputs(rng: np.random.Generator) -> tuple:
@@ -55,51 +179,65 @@ def _loss(
 QUESTIONS = (
     Question(
         id="ex05.q1",
-        name="windows",
-        points=2,
-        title="the sliding window",
-        expects="window [i, j] holds the rows x columns heights whose lowest corner is cell (i, "
-        "j), flattened with y fastest; one window for every place where it fits.",
-        draw=_map_and_window,
-        truth=_windows,
+        name="tensorize",
+        points=3,
+        title="the sliding window, four headings, little work",
+        expects="tensor[ix, iy, k] is what `ask` says of the window that lies ahead of cell (ix, "
+        "iy) along heading 0, 90, 180 or 270 degrees, relative to the cell's own height; 0 where "
+        "the window leaves the map or holds an unknown cell. Such windows are not asked, every "
+        "other one is asked exactly once, in at most four calls.",
+        draw=_map_with_gap,
+        harness=tensor_answers,
+        truth=_tensorize,
         mistakes=(
             Mistake(
-                "a window read y first: x varies slowest in a flattened patch: rows follow one "
-                "another as they lie.",
-                lambda h, r, c: (
-                    sliding_window_view(h, (r, c))
-                    .swapaxes(-1, -2)
-                    .reshape(len(h) - r + 1, -1, r * c)
-                ),
+                "one call per window: collect the windows of a heading, and ask them together.",
+                lambda *given: _tensorize(*given, single=True),
             ),
             Mistake(
-                "one window too few: a map of nx cells holds nx - rows + 1 windows along x, not nx "
-                "- rows.",
-                lambda h, r, c: _windows(h, r, c)[:-1, :-1],
+                "windows asked twice: each one is asked once; keep the answer.",
+                lambda *given: _tensorize(*given, twice=True),
             ),
             Mistake(
-                "windows side by side: it jumps by whole windows; it should slide by one cell.",
-                lambda h, r, c: _windows(h, r, c)[::r, ::c],
+                "unknown windows asked: leave them out before `ask`; putting 0 into the tensor "
+                "afterwards wastes the work.",
+                lambda *given: _tensorize(*given, unknown=True),
             ),
             Mistake(
-                "a window turned on its side: rows run along x, the first axis; columns along y.",
-                lambda h, r, c: _windows(h, c, r),
+                "absolute heights: a window is relative to the height of the cell where the robot "
+                "stands.",
+                lambda *given: _tensorize(*given, relative=False),
             ),
             Mistake(
-                "windows in swapped order: the first axis of the answer is i, along x.",
-                lambda h, r, c: _windows(h, r, c).swapaxes(0, 1),
+                "headings that turn clockwise: index 1 is +y, index 3 is -y.",
+                lambda *given: _tensorize(*given)[..., [0, 3, 2, 1]],
+            ),
+            Mistake(
+                "one heading for all: the window turns with the robot.",
+                lambda *given: _tensorize(*given, headings=(0, 0, 0, 0)),
+            ),
+            Mistake(
+                "left and right exchanged: the columns of a window run from the robot's right to "
+                "its left.",
+                lambda *given: _tensorize(*given, mirrored=True),
+            ),
+            Mistake(
+                "a window centred on the robot: its first row is the one that the robot stands in.",
+                lambda *given: _tensorize(*given, back=1),
             ),
         ),
         hints=(
-            "How many places are there along x for 3 rows in a map of 6?",
-            "heights[i : i + rows, j : j + columns].ravel() is one window.",
-            "numpy.lib.stride_tricks.sliding_window_view makes them all without copying.",
+            "Turn the map, not the window: np.rot90(heights, -k) brings heading k to +x. Turn the "
+            "answers back with np.rot90(plane, k).",
+            "sliding_window_view(turned, (rows, columns)) holds the windows along +x; the robot of "
+            "window [i, j] stands at cell [i, j + columns // 2].",
+            "known = np.isfinite(windows).all(axis=-1); scores[known] = ask(windows[known])",
         ),
     ),
     Question(
         id="ex05.q2",
         name="first_layer",
-        points=3,
+        points=1,
         title="one neuron of the first layer, everywhere at once",
         expects="the answer at (i, j) is the sum over the window of heights * kernel, plus the "
         "bias once: what that neuron says to the window at (i, j).",
@@ -107,8 +245,8 @@ QUESTIONS = (
         truth=_layer,
         mistakes=(
             Mistake(
-                "a flipped kernel: that is the mathematician's convolution; a network correlates, "
-                "without flipping.",
+                "a flipped kernel: in mathematics a convolution flips its kernel; a network's does "
+                "not.",
                 lambda h, k, b: _layer(h, k[::-1, ::-1], b),
             ),
             Mistake(
@@ -124,7 +262,8 @@ QUESTIONS = (
                 lambda h, k, b: _layer(h, k, b * k.size),
             ),
             Mistake(
-                "mean for sum: a neuron sums its inputs.", lambda h, k, b: _layer(h, k / k.size, b)
+                "a mean over the window: a neuron sums its inputs.",
+                lambda h, k, b: _layer(h, k / k.size, b),
             ),
         ),
         hints=(
@@ -136,7 +275,7 @@ QUESTIONS = (
     Question(
         id="ex05.q3",
         name="turned",
-        points=2,
+        points=1,
         title="turn the map, and the headings turn with it",
         expects="after `quarters` quarter turns counter-clockwise the map is np.rot90(map, "
         "quarters), and what was feasible along heading k is feasible along k + 2 * quarters.",
@@ -152,7 +291,7 @@ QUESTIONS = (
                 lambda f, q: _turned(f, q, q),
             ),
             Mistake(
-                "headings turned the other way: counter-clockwise, headings count up: 0 (+x) "
+                "headings turned clockwise: counter-clockwise, headings count up: 0 (+x) "
                 "becomes 2 (+y).",
                 lambda f, q: _turned(f, q, -2 * q),
             ),
@@ -176,10 +315,10 @@ QUESTIONS = (
     Question(
         id="ex05.q4",
         name="reconstruction",
-        points=2,
+        points=1,
         title="L_recon without decoding a patch",
-        expects="||a - D g||^2 = squares - 2 products . g + g . gram g, one number per patch; with "
-        "squares = ||a||^2, products = D^T a and gram = D^T D no patch is decoded.",
+        expects="the squared distance between a patch a and its decoded D g, one number per patch, "
+        "worked out without D and without a.",
         draw=_decoder,
         truth=lambda codes, squares, products, gram: _loss(codes, squares, products, gram),
         mistakes=(
@@ -209,6 +348,55 @@ QUESTIONS = (
         hints=(
             "Multiply out ||a - D g||^2 as you would (a - b)^2.",
             "((codes @ gram) * codes).sum(axis=-1) is g . gram g for every patch.",
+        ),
+    ),
+    Question(
+        id="ex05.q5",
+        name="reassess",
+        points=3,
+        title="paint a step, and ask only where it counts",
+        expects="the answers for the map `after` the change; only windows that hold a changed cell "
+        "and no unknown one are asked, in one call; a window with an unknown cell has 0, and the "
+        "array that was given is not changed.",
+        draw=_stroke,
+        harness=update_answers,
+        truth=_reassess,
+        mistakes=(
+            Mistake(
+                "the whole map asked again: only windows that hold a changed cell can have a new "
+                "answer.",
+                lambda *given: _reassess(*given, everything=True),
+            ),
+            Mistake(
+                "changed corners alone: a window holds rows x columns cells, and each of them may "
+                "have changed.",
+                lambda *given: _reassess(*given, corner=True),
+            ),
+            Mistake(
+                "an old answer where a cell became unknown: its windows are 0 now.",
+                lambda *given: _reassess(*given, stale=True),
+            ),
+            Mistake(
+                "windows of the map before: ask about the map `after` the change.",
+                lambda old, before, after, r, c, ask: _reassess(
+                    old, before, after, r, c, ask, shown=np.where(np.isnan(before), after, before)
+                ),
+            ),
+            Mistake(
+                "one call per window: ask all of them together.",
+                lambda *given: _reassess(*given, single=True),
+            ),
+            Mistake(
+                "the given array changed: it belongs to the caller; work on answers.copy().",
+                lambda *given: _reassess(*given, in_place=True),
+            ),
+        ),
+        hints=(
+            "changed = before != after (an unknown cell, NaN, counts as changed: its windows are 0 "
+            "before and after, so no harm is done)",
+            "sliding_window_view(changed, (rows, columns)).any(axis=(-2, -1)) says which windows "
+            "hold a changed cell.",
+            "Set all of these to 0 first, then ask those among them that are known.",
         ),
     ),
 )

@@ -8,7 +8,10 @@ from fgtutor.directions import STEP_LENGTHS, STEPS
 
 def _tensors(rng: np.random.Generator) -> tuple:
     # One decimal, so that policies tie here and there.
-    return (rng.uniform(0, 1, (3, 4, 3, 8)).round(1),)
+    tensors = rng.uniform(0, 1, (3, 4, 3, 8)).round(1)
+    tensors[1, 0, 0] = tensors[2, 0, 0] = 1.0
+    tensors[0, 0, 0] = 0.5
+    return (tensors,)
 
 
 def _fused(rng: np.random.Generator) -> tuple:
@@ -57,6 +60,88 @@ def _both_ways(costs: np.ndarray, start: tuple[int, int], goal: tuple[int, int])
     return _cheapest(np.minimum(costs, np.stack(back, axis=-1)), start, goal)
 
 
+_WALL = (np.where((np.arange(4) == 1)[:, None, None], np.inf, np.ones((4, 3, 8))), (0, 1), (3, 1))
+"""No edge leaves column 1, so the far side is out of reach."""
+_ON_THE_SPOT = (np.ones((3, 3, 8)), (1, 1), (1, 1))
+"""Start and goal are one."""
+_ONE_WAY = (np.where(np.arange(8) < 2, 1.0, 5.0) * np.ones((3, 2, 1)), (2, 0), (0, 0))
+"""Towards +x is cheap, and back is dear."""
+
+
+def _cells(
+    costs: np.ndarray, start: tuple[int, int], goal: tuple[int, int], last: bool = True
+) -> np.ndarray:
+    """Go down from start to goal by the cost that is left from each cell."""
+    if not np.isfinite(_cheapest(costs, start, goal)):
+        return np.zeros((0, 2), dtype=int)
+    cells, shape = [start], costs.shape[:2]
+    while cells[-1] != goal:
+        here = cells[-1]
+        onward = [(here[0] + int(dx), here[1] + int(dy)) for dx, dy in STEPS]
+        left = [
+            costs[(*here, k)] + _cheapest(costs, cell, goal)
+            if all(0 <= i < n for i, n in zip(cell, shape, strict=True))
+            else np.inf
+            for k, cell in enumerate(onward)
+        ]
+        cells.append(onward[int(np.argmin(left))])
+    return np.array(cells if last else cells[:-1])
+
+
+def _choices(rng: np.random.Generator) -> tuple:
+    tensors = rng.uniform(0.05, 1, (2, 6, 3, 8))
+    tensors[1, 0], tensors[0, 4] = 0.05, 0.05  # either policy has a column that it cannot leave
+    return tensors, 0.3, float(rng.uniform(0.5, 2)), (0, int(rng.integers(3))), (5, 1)
+
+
+def _switching(
+    tensors: np.ndarray,
+    f_min: float,
+    switch_cost: float,
+    start: tuple[int, int],
+    goal: tuple[int, int],
+    *,
+    first: bool = False,
+    forbidden: bool = False,
+    every: bool = False,
+) -> float:
+    """Relax all moves and switches until nothing changes; the options make it wrong."""
+    policies, nx, ny, _ = tensors.shape
+    best = np.full((policies, nx + 2, ny + 2), np.inf)
+    best[:, goal[0] + 1, goal[1] + 1] = 0.0
+    costs = np.where(tensors >= f_min, 1 / tensors, np.inf) + (switch_cost if every else 0.0)
+    for _ in range(policies * nx * ny):
+        onward = [
+            costs[..., k] + best[:, 1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny]
+            for k, (dx, dy) in enumerate(STEPS)
+        ]
+        moved = np.minimum(best[:, 1:-1, 1:-1], np.min(onward, axis=0))
+        if not forbidden:
+            moved = np.minimum(moved, moved.min(axis=0) + (0.0 if every else switch_cost))
+        if np.array_equal(moved, best[:, 1:-1, 1:-1]):
+            break
+        best[:, 1:-1, 1:-1] = moved
+    return float(best[:, start[0] + 1, start[1] + 1].min() + first * switch_cost)
+
+
+def _after_fusing(
+    tensors: np.ndarray,
+    f_min: float,
+    switch_cost: float,
+    start: tuple[int, int],
+    goal: tuple[int, int],
+) -> float:
+    """Plan on the fused tensor, and pay for the switches afterwards."""
+    fused = tensors.max(axis=0)
+    cells = _cells(np.where(fused >= f_min, 1 / fused, np.inf), start, goal)
+    if not len(cells):
+        return np.inf
+    headings = (np.diff(cells, axis=0)[:, None] == STEPS).all(axis=-1).argmax(axis=-1)
+    policies = tensors.argmax(axis=0)[cells[:-1, 0], cells[:-1, 1], headings]
+    cost = (1 / _edges(fused, cells)).sum()
+    return float(cost + switch_cost * np.count_nonzero(np.diff(policies)))
+
+
 def _route(rng: np.random.Generator) -> tuple:
     fused = rng.uniform(0.1, 1, (6, 6, 8))
     cells = [np.array([2, 3])]
@@ -82,7 +167,7 @@ QUESTIONS = (
     Question(
         id="ex06.q1",
         name="fuse",
-        points=2,
+        points=1,
         title="the best policy, and how good it is",
         expects="fused[x, y, k] is the largest F_i[x, y, k] over the policies i, and the policy "
         "map the number of that policy (of the first, where they tie).",
@@ -90,21 +175,20 @@ QUESTIONS = (
         truth=lambda tensors: (tensors.max(axis=0), tensors.argmax(axis=0)),
         mistakes=(
             Mistake(
-                "mean for max: a good policy is not made worse by bad colleagues.",
+                "a mean over the policies: take the best one; the others do not make it worse.",
                 lambda t: (t.mean(axis=0), t.argmax(axis=0)),
             ),
             Mistake(
-                "argmin for argmax: F is feasibility: high is good.",
+                "the worst policy: F is a feasibility, high is good: argmax, not argmin.",
                 lambda t: (t.max(axis=0), t.argmin(axis=0)),
             ),
             Mistake(
-                "max for argmax: the policy map holds the NUMBER of the best policy, not its "
-                "value.",
+                "values in the policy map: it holds the NUMBER of the best policy (argmax).",
                 lambda t: (t.max(axis=0), t.max(axis=0)),
             ),
             Mistake(
-                "the best heading for the best policy: it compares along the headings (axis -1); "
-                "policies are the first axis.",
+                "the best heading in place of the best policy: it compares along the headings "
+                "(axis -1); policies are the first axis.",
                 lambda t: (t.max(axis=-1), t.argmax(axis=-1)),
             ),
             Mistake(
@@ -124,10 +208,10 @@ QUESTIONS = (
     Question(
         id="ex06.q2",
         name="edge_costs",
-        points=2,
+        points=1,
         title="from feasibility to cost",
-        expects="an edge costs 1 / F where F >= f_min; any other edge does not exist, so it costs "
-        "infinity.",
+        expects="the lower F, the dearer the edge: 1 at F = 1, 2 at F = 0.5; an edge with F < "
+        "f_min does not exist, so it costs infinity.",
         draw=_fused,
         truth=lambda fused, f_min: np.where(fused >= f_min, 1 / fused, np.inf),
         mistakes=(
@@ -135,6 +219,11 @@ QUESTIONS = (
                 "1 - F for 1 / F: the paper takes the inverse: a hardly feasible step must cost "
                 "far more.",
                 lambda f, m: np.where(f >= m, 1 - f, np.inf),
+            ),
+            Mistake(
+                "-log F in place of 1 / F: that is the cost if steps succeed independently with "
+                "probability F; the paper's is the inverse.",
+                lambda f, m: np.where(f >= m, -np.log(f), np.inf),
             ),
             Mistake(
                 "edges that should be closed: below f_min there is no edge, whatever it would "
@@ -151,7 +240,7 @@ QUESTIONS = (
                 lambda f, m: np.where(f >= m, 1 / f, 0.0),
             ),
             Mistake(
-                "feasibility for cost: high F is good, high cost is bad.",
+                "F itself as a cost: high F is good, high cost is bad.",
                 lambda f, m: np.where(f >= m, f, np.inf),
             ),
         ),
@@ -164,18 +253,29 @@ QUESTIONS = (
         id="ex06.q3",
         name="cheapest",
         points=3,
-        title="Dijkstra",
+        title="Dijkstra, with a heap",
         expects="the cost of the cheapest chain of edges from start to goal, where costs[ix, iy, "
         "k] is paid for LEAVING a cell along heading k; infinity if no chain joins them.",
         draw=_costs,
+        examples=(_WALL, _ON_THE_SPOT, _ONE_WAY),
         truth=_cheapest,
         mistakes=(
             Mistake(
-                "a search for the fewest steps: a longer way over easy ground may be cheaper.",
+                "no answer where there is no route: a goal that cannot be reached costs infinity.",
+                lambda *case: np.nan_to_num(_cheapest(*case), posinf=0.0),
+            ),
+            Mistake(
+                "steps counted: each edge has a cost of its own, and the sum is asked for.",
+                lambda costs, start, goal: _cheapest(
+                    np.where(np.isfinite(costs), 1.0, np.inf), start, goal
+                ),
+            ),
+            Mistake(
+                "a search for the fewest steps: a longer route over easy ground may be cheaper.",
                 _fewest_steps,
             ),
             Mistake(
-                "the way back: it leads from goal to start: up a step is not down a step.",
+                "a route from goal to start: up a step is not down a step.",
                 lambda costs, start, goal: _cheapest(costs, goal, start),
             ),
             Mistake(
@@ -193,15 +293,17 @@ QUESTIONS = (
             ),
         ),
         hints=(
-            "networkx.DiGraph with one edge per finite cost, then networkx.dijkstra_path_length.",
-            "The neighbour along k is (ix + STEPS[k][0], iy + STEPS[k][1]); skip it off the map.",
-            "networkx.NetworkXNoPath (or a goal without edges) means infinity.",
+            "Keep a heap of (cost so far, cell), beginning with (0.0, start), and a dictionary of "
+            "the best cost of each cell. heapq.heappop gives the cheapest entry.",
+            "The neighbour along k is (ix + STEPS[k][0], iy + STEPS[k][1]); skip it off the map, "
+            "or if the cost is infinite, or if it is no cheaper than what is known.",
+            "The first time the goal is popped, its cost is final. An empty heap means infinity.",
         ),
     ),
     Question(
         id="ex06.q4",
         name="route_cost",
-        points=2,
+        points=1,
         title="what does a route cost?",
         expects="the sum over its steps of 1 / F of the cell that is LEFT, along the step's "
         "heading: a route of n cells has n - 1 steps.",
@@ -225,7 +327,8 @@ QUESTIONS = (
                 lambda f, c: 1 / _edges(f, c).sum(),
             ),
             Mistake(
-                "mean for sum: every step has to be paid.", lambda f, c: (1 / _edges(f, c)).mean()
+                "a mean over the steps: every step has to be paid.",
+                lambda f, c: (1 / _edges(f, c)).mean(),
             ),
             Mistake(
                 "costs times step length: the paper's edge cost is 1 / F for diagonals too.",
@@ -236,5 +339,120 @@ QUESTIONS = (
             "np.diff(cells, axis=0) are the steps: which row of STEPS is each?",
             "(step == STEPS).all(axis=-1).argmax() is the heading of one step.",
         ),
+    ),
+    Question(
+        id="ex06.q5",
+        name="cheapest_route",
+        points=3,
+        title="the route itself",
+        expects="the cells [n, 2] of the cheapest route, start and goal included, each a "
+        "neighbour of the one before; an array of shape (0, 2) if there is no route.",
+        draw=_costs,
+        examples=(_WALL,),
+        truth=lambda costs, start, goal: _cells(costs, start, goal),
+        mistakes=(
+            Mistake(
+                "a route that begins at the goal: predecessors are followed backwards, so turn "
+                "the list around.",
+                lambda *case: _cells(*case)[::-1],
+            ),
+            Mistake(
+                "a route without its goal: the last cell belongs to it.",
+                lambda *case: _cells(*case, last=False),
+            ),
+            Mistake(
+                "a route without its start: the first cell belongs to it.",
+                lambda *case: _cells(*case)[1:],
+            ),
+            Mistake(
+                "the fewest steps: a longer route over easy ground may be cheaper.",
+                lambda costs, start, goal: _cells(costs + 1e4, start, goal),
+            ),
+            Mistake(
+                "a route from goal to start: costs[ix, iy, k] is paid for LEAVING a cell.",
+                lambda costs, start, goal: _cells(costs, goal, start)[::-1],
+            ),
+            Mistake("swapped axes: each row is (ix, iy).", lambda *case: _cells(*case)[:, ::-1]),
+        ),
+        hints=(
+            "Dijkstra as in question 3; whenever a cell gets a better cost, note from which cell "
+            "it was reached.",
+            "From the goal, follow these notes back to the start, and turn the list around.",
+            "np.zeros((0, 2), dtype=int) is an empty route.",
+        ),
+    ),
+    Question(
+        id="ex06.q6",
+        name="cheapest_switching",
+        points=3,
+        title="a planner that thinks before it switches",
+        expects="the smallest sum of 1 / F_p of every step, p the policy in charge, plus "
+        "switch_cost for every change of policy; steps with F_p < f_min are closed for p, the "
+        "first policy is free, and infinity says that there is no route.",
+        draw=_choices,
+        examples=((np.full((2, 3, 2, 8), 0.05), 0.1, 1.0, (0, 0), (2, 0)),),
+        truth=lambda tensors, f_min, switch_cost, start, goal: _switching(
+            tensors, f_min, switch_cost, start, goal
+        ),
+        mistakes=(
+            Mistake(
+                "switches paid after the search: it must know of them while it searches, or it "
+                "takes the cheapest route for a robot that switches for nothing.",
+                _after_fusing,
+            ),
+            Mistake(
+                "switches for nothing: every change of policy costs switch_cost.",
+                lambda t, f, s, start, goal: _switching(t, f, 0.0, start, goal),
+            ),
+            Mistake(
+                "one policy for the whole route: a switch is dear, not forbidden.",
+                lambda t, f, s, start, goal: _switching(t, f, s, start, goal, forbidden=True),
+            ),
+            Mistake(
+                "a first policy that is paid for: the robot may start with any policy.",
+                lambda t, f, s, start, goal: _switching(t, f, s, start, goal, first=True),
+            ),
+            Mistake(
+                "a price on every step: only a CHANGE of policy costs.",
+                lambda t, f, s, start, goal: _switching(t, f, s, start, goal, every=True),
+            ),
+            Mistake(
+                "closed steps used: below f_min a policy has no such step.",
+                lambda t, f, s, start, goal: _switching(t, 0.0, s, start, goal),
+            ),
+        ),
+        hints=(
+            "A state is (ix, iy, policy). Put one state per policy on the heap at the start, all "
+            "with cost 0.",
+            "From a state there are two kinds of edges: to the neighbours, with the same policy, "
+            "and to the other policies on the same cell, for switch_cost.",
+            "The first state on the goal cell that is popped, whatever its policy, is the answer.",
+        ),
+    ),
+    Question(
+        id="ex06.q7",
+        name="detour_at",
+        points=2,
+        title="when is a detour worth it?",
+        expects="the F at which one step over the obstacle costs as much as the four steps around "
+        "it, by the paper's edge cost.",
+        truth=lambda: 1 / 4,
+        mistakes=(
+            Mistake(
+                "the extra steps alone: around the obstacle there are four steps in place of one, "
+                "and the one over it is saved.",
+                lambda: 1 / 3,
+            ),
+            Mistake("a cost in place of a feasibility: at which F is 1 / F that?", lambda: 4.0),
+            Mistake("1 - F in place of 1 / F: no such F would reach a cost of 4.", lambda: -3.0),
+            Mistake(
+                "-log F in place of 1 / F: steps with F = 1 would then cost nothing.", lambda: 1.0
+            ),
+            Mistake(
+                "f_min in place of the balance: there the step closes altogether.", lambda: 0.1
+            ),
+        ),
+        hints=("What do four steps with F = 1 cost?", "1 / F = 4"),
+        rtol=5e-3,
     ),
 )

@@ -1,4 +1,4 @@
-"""Exercise 08, "Meet the A1": actuators, observations, mirror images, rewards."""
+"""Exercise 08, "Meet the A1": actuators, observations, mirror images, a joint in motion."""
 
 import numpy as np
 
@@ -12,7 +12,9 @@ SIGNS = np.array((-1.0, 1.0, 1.0) * 4)
 def _joints(rng: np.random.Generator) -> tuple:
     stance = rng.uniform(-1, 1, 12)
     q = stance + rng.uniform(-0.4, 0.4, 12)
-    return q, rng.uniform(-6, 6, 12), rng.uniform(-2.5, 2.5, 12), stance
+    action = rng.uniform(-2.5, 2.5, 12)
+    action[:2] = 4.0, -4.0  # beyond what the motor can give
+    return q, rng.uniform(-6, 6, 12), action, stance
 
 
 def _torque(
@@ -39,20 +41,48 @@ def _down(quaternion: np.ndarray) -> np.ndarray:
     return -np.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)), axis=-1)
 
 
-def _terms(rng: np.random.Generator) -> tuple:
-    terms = rng.uniform(0, 1, (6, 4))
-    terms[:2, 2:] += 3  # two robots whose penalties outweigh what they gain
-    return terms, np.array([1.2, 0.5, -2.0, -0.5]), 0.02
+def _joint(rng: np.random.Generator) -> tuple:
+    inertia, damping = float(rng.uniform(0.04, 0.06)), float(rng.uniform(1.0, 1.6))
+    return float(rng.uniform(0.5, 1.2)), inertia, 35.0, damping, 15.0, 0.005, 200
+
+
+def _response(
+    target: float,
+    inertia: float,
+    kp: float,
+    kd: float,
+    limit: float,
+    dt: float,
+    steps: int,
+    *,
+    explicit: bool = False,
+    band: float = 0.05,
+    entered: bool = False,
+    peak: bool = False,
+) -> tuple[np.ndarray, float, float]:
+    """Step a joint of mass inertia; the options make it wrong."""
+    angles, q, dq = np.zeros(steps), 0.0, 0.0
+    for i in range(steps):
+        before = dq
+        dq += dt * min(max(kp * (target - q) - kd * dq, -limit), limit) / inertia
+        q += dt * (before if explicit else dq)
+        angles[i] = q
+    inside = np.abs(angles - target) <= band * abs(target)
+    settled = np.flatnonzero(inside) if entered else np.flatnonzero(~inside) + 1
+    at = (settled[:1] if entered else settled[-1:]).sum()
+    time = np.nan if not inside[-1] else float((at + 1) * dt)
+    over = float(angles.max()) - (0.0 if peak else target)
+    return angles, over if peak else max(over, 0.0), time
 
 
 QUESTIONS = (
     Question(
         id="ex08.q1",
         name="joint_torques",
-        points=3,
+        points=1,
         title="from an action to torques",
-        expects="torque = 35 (stance + 0.5 action - q) - 0.5 dq, no larger than 33.5 N m either "
-        "way: an action moves the target AROUND the stance, and damping opposes the speed.",
+        expects="an action of 0 pulls a joint to its stance, an action of 1 to 0.5 rad beyond it; "
+        "damping opposes the speed; no torque is larger than 33.5 N m.",
         draw=_joints,
         truth=lambda q, dq, action, stance: _torque(q, dq, action, stance),
         mistakes=(
@@ -90,8 +120,8 @@ QUESTIONS = (
     Question(
         id="ex08.q2",
         name="gravity_in_body",
-        points=2,
-        title="which way is down, seen from the trunk?",
+        points=1,
+        title="where is down, seen from the trunk?",
         expects="the world's (0, 0, -1) in the trunk's frame, R^T (0, 0, -1): level, it is (0, 0, "
         "-1); nose down (pitch +90 degrees), it is (1, 0, 0).",
         draw=_quaternions,
@@ -99,15 +129,15 @@ QUESTIONS = (
         truth=_down,
         mistakes=(
             Mistake(
-                "R for its transpose: that turns a vector of the trunk into the world; here it is "
-                "the other way round.",
+                "R in place of its transpose: R turns a vector of the trunk into the world; here "
+                "the world's is turned into the trunk's frame.",
                 lambda q: _down(q * (1, -1, -1, -1)),
             ),
             Mistake(
                 "a quaternion read as (x, y, z, w): w comes first, as in MuJoCo.",
                 lambda q: _down(np.roll(q, 1, axis=-1)),
             ),
-            Mistake("up for down: gravity points to -z.", lambda q: -_down(q)),
+            Mistake("a direction upwards: gravity points to -z.", lambda q: -_down(q)),
             Mistake(
                 "the world's own down: nothing was turned: that is the same for every posture.",
                 lambda q: np.tile((0.0, 0.0, -1.0), (len(q), 1)),
@@ -122,7 +152,7 @@ QUESTIONS = (
     Question(
         id="ex08.q3",
         name="mirrored",
-        points=2,
+        points=1,
         title="the robot's mirror image",
         expects="left and right legs change places (FR with FL, RR with RL), hip angles change "
         "sign, thighs and calves do not; mirroring twice changes nothing.",
@@ -136,8 +166,8 @@ QUESTIONS = (
             ),
             Mistake("legs that stay: the right leg's image is a left leg.", lambda j: j * SIGNS),
             Mistake(
-                "front for rear: the mirror stands along the robot, not across it: FR changes with "
-                "FL.",
+                "front and rear exchanged: the mirror stands along the robot, not across it: FR "
+                "changes with FL.",
                 lambda j: np.roll(j, 6, axis=-1) * SIGNS,
             ),
             Mistake(
@@ -156,39 +186,55 @@ QUESTIONS = (
     ),
     Question(
         id="ex08.q4",
-        name="reward",
-        points=2,
-        title="many terms, one reward",
-        expects="the weighted sum of all terms of a robot, not below 0, times dt: weights are per "
-        "second, and a robot never earns by ending its episode.",
-        draw=_terms,
-        truth=lambda terms, weights, dt: np.maximum(terms @ weights, 0.0) * dt,
+        name="step_response",
+        points=3,
+        title="a joint that swings to its target",
+        expects="each step first changes the speed by torque / inertia * dt, with the torque of "
+        "question 1 within the limit, then the angle by the NEW speed; the overshoot is how far "
+        "beyond the target the angle got (0 if never), the settling time the end of the first step "
+        "from which on the angle stays within 5 % of the target (NaN if it is not there at the "
+        "end).",
+        draw=_joint,
+        examples=(
+            (1.0, 0.05, 35.0, 0.0, 33.5, 0.005, 200),  # never settles
+            (1.0, 0.05, 35.0, 8.0, 33.5, 0.005, 400),  # never overshoots
+        ),
+        truth=lambda target, inertia, kp, kd, limit, dt, steps: _response(
+            target, inertia, kp, kd, limit, dt, steps
+        ),
         mistakes=(
             Mistake(
-                "a forgotten floor: when every step costs, falling over early is the best a robot "
-                "can do.",
-                lambda t, w, dt: (t @ w) * dt,
+                "the old speed: update the speed first, and move by the new one, or the swing "
+                "gains energy in every step.",
+                lambda *case: _response(*case, explicit=True),
             ),
             Mistake(
-                "a floor under each term: then penalties count nothing; the floor is for the sum.",
-                lambda t, w, dt: np.maximum(t * w, 0).sum(axis=-1) * dt,
+                "a forgotten limit: the motor gives no more than `limit`.",
+                lambda t, i, kp, kd, lim, dt, n: _response(t, i, kp, kd, np.inf, dt, n),
             ),
             Mistake(
-                "a forgotten dt: weights are per second, a step lasts dt.",
-                lambda t, w, dt: np.maximum(t @ w, 0),
+                "a forgotten inertia: an acceleration is torque / inertia.",
+                lambda t, i, kp, kd, lim, dt, n: _response(t, 1.0, kp, kd, lim, dt, n),
             ),
             Mistake(
-                "mean for sum: terms add up.",
-                lambda t, w, dt: np.maximum((t * w).mean(axis=-1), 0) * dt,
+                "the first time inside the band: it may swing out again; the joint has settled "
+                "when it STAYS inside.",
+                lambda *case: _response(*case, entered=True),
             ),
             Mistake(
-                "one reward for all robots: each row of terms is a robot: sum over the last axis.",
-                lambda t, w, dt: max((t * w).sum(), 0) * dt,
+                "the peak in place of the overshoot: subtract the target.",
+                lambda *case: _response(*case, peak=True),
+            ),
+            Mistake(
+                "a band of 2 %: 5 % of the target is asked for.",
+                lambda *case: _response(*case, band=0.02),
             ),
         ),
         hints=(
-            "terms @ weights is one number per robot.",
-            "np.maximum(..., 0.0) first, then times dt.",
+            "A loop of four lines: torque, limit, speed, angle.",
+            "inside = np.abs(angles - target) <= 0.05 * abs(target); the last step that is not "
+            "inside is the one before the joint has settled.",
+            "np.flatnonzero(~inside) lists the steps outside; step i ends at (i + 1) * dt.",
         ),
     ),
 )

@@ -44,6 +44,59 @@ def _advantages(
     )
 
 
+def _half_reset(
+    rewards: np.ndarray,
+    values: np.ndarray,
+    done: np.ndarray,
+    gamma: float,
+    lam: float,
+    bootstrap: bool,
+) -> np.ndarray:
+    answer, following = np.zeros(len(rewards)), 0.0
+    for t in reversed(range(len(rewards))):
+        ahead = values[t + 1] if bootstrap or not done[t] else 0.0
+        carried = following if not bootstrap or not done[t] else 0.0
+        following = rewards[t] + gamma * ahead - values[t] + gamma * lam * carried
+        answer[t] = following
+    return answer
+
+
+def _batch(rng: np.random.Generator) -> tuple:
+    steps, robots = 8, 3
+    fell, timed_out = np.zeros((2, steps, robots), dtype=bool)
+    fell[rng.integers(2, 6), 0] = timed_out[rng.integers(2, 6), 1] = True
+    gamma, lam = float(rng.uniform(0.9, 0.99)), float(rng.uniform(0.8, 0.97))
+    rewards, values = rng.uniform(0, 1, (steps, robots)), rng.uniform(0, 5, (steps, robots))
+    return rewards, values, rng.uniform(0, 5, (steps, robots)), fell, timed_out, gamma, lam
+
+
+def _batch_advantages(
+    rewards: np.ndarray,
+    values: np.ndarray,
+    next_values: np.ndarray,
+    fell: np.ndarray,
+    timed_out: np.ndarray,
+    gamma: float,
+    lam: float,
+    *,
+    scaled: str = "all",
+) -> np.ndarray:
+    """Sum the surprises of each episode, robot by robot; `scaled` otherwise makes it wrong."""
+    surprise = rewards + gamma * np.where(fell, 0.0, next_values) - values
+    raw = np.zeros(rewards.shape)
+    for start, robot in np.ndindex(rewards.shape):
+        ends = np.flatnonzero((fell | timed_out)[start:, robot])
+        stop = start + int(ends[0]) + 1 if len(ends) else len(rewards)
+        weight = (gamma * lam) ** np.arange(stop - start)
+        raw[start, robot] = weight @ surprise[start:stop, robot]
+    if scaled == "none":
+        return raw
+    if scaled == "mean":
+        return raw - raw.mean()
+    axis = 0 if scaled == "robot" else None
+    return (raw - raw.mean(axis=axis)) / raw.std(axis=axis)
+
+
 def _rate(rate: float, kl: float, desired: float, *, slower: float = 1.5) -> float:
     if kl > 2 * desired:
         rate /= slower
@@ -60,7 +113,7 @@ QUESTIONS = (
     Question(
         id="ex09.q1",
         name="next_rows",
-        points=2,
+        points=1,
         title="a curriculum in one line",
         expects="one row up if mean r_v > 0.5 and the robot did not fall; one row down if mean r_v "
         "< 0.3 or it fell; rows stay within 0 ... last.",
@@ -89,7 +142,7 @@ QUESTIONS = (
                 lambda row, mean, failed, last: np.clip(row - _moves(mean, failed), 0, last),
             ),
             Mistake(
-                "no way down: a robot stuck on ground too hard for it learns nothing.",
+                "no row down: a robot stuck on ground too hard for it learns nothing.",
                 lambda row, mean, failed, last: np.clip(row + ((mean > UP) & ~failed), 0, last),
             ),
         ),
@@ -101,16 +154,25 @@ QUESTIONS = (
     Question(
         id="ex09.q2",
         name="advantages",
-        points=2,
+        points=1,
         title="generalised advantages",
-        expects="A_t = d_t + gamma lam A_(t+1) with d_t = r_t + gamma V_(t+1) - V_t; where done, "
-        "neither V_(t+1) nor A_(t+1) counts, since they belong to another episode.",
+        expects="each later surprise counts gamma * lam times less; neither values nor surprises "
+        "of the next episode count in this one.",
         draw=_rollout,
         truth=_advantages,
         mistakes=(
             Mistake(
-                "an advantage that crosses a reset: after done comes another robot's life.",
+                "an advantage that crosses a reset: after done a new episode begins.",
                 lambda r, v, done, g, lam: _advantages(r, v, done & False, g, lam),
+            ),
+            Mistake(
+                "half a reset: where done, V_(t+1) is left out, but A_(t+1) still counts.",
+                lambda r, v, done, g, lam: _half_reset(r, v, done, g, lam, bootstrap=False),
+            ),
+            Mistake(
+                "the other half of a reset: where done, A_(t+1) is left out, but V_(t+1) still "
+                "counts.",
+                lambda r, v, done, g, lam: _half_reset(r, v, done, g, lam, bootstrap=True),
             ),
             Mistake(
                 "a forgotten lambda: each later surprise counts gamma * lam times less.",
@@ -139,7 +201,7 @@ QUESTIONS = (
     Question(
         id="ex09.q3",
         name="next_rate",
-        points=2,
+        points=1,
         title="a learning rate that follows the KL",
         expects="the rate is divided by 1.5 if KL > 2 desired, multiplied by 1.5 if KL < desired / "
         "2, else kept; always within 1e-5 ... 1e-2.",
@@ -166,7 +228,7 @@ QUESTIONS = (
                 _unlimited,
             ),
             Mistake(
-                "no band of peace: between desired / 2 and 2 desired the rate is kept.",
+                "a rate that always changes: between desired / 2 and 2 desired it stays as it is.",
                 lambda rate, kl, desired: min(
                     max(rate / 1.5 if kl > desired else rate * 1.5, 1e-5), 1e-2
                 ),
@@ -179,6 +241,55 @@ QUESTIONS = (
         hints=(
             "Three cases: too far, not far enough, just right.",
             "min(max(rate, 1e-5), 1e-2) at the end.",
+        ),
+    ),
+    Question(
+        id="ex09.q4",
+        name="batch_advantages",
+        points=3,
+        title="a whole rollout, with falls and time-outs",
+        expects="generalised advantages in which nothing is carried back over an end; after a fall "
+        "the future is worth 0, after a time-out it is worth next_values; then the mean of all is "
+        "0 and their standard deviation 1.",
+        draw=_batch,
+        truth=lambda rewards, values, next_values, fell, timed_out, gamma, lam: _batch_advantages(
+            rewards, values, next_values, fell, timed_out, gamma, lam
+        ),
+        mistakes=(
+            Mistake(
+                "a time-out treated as a fall: the robot could have gone on, so what follows is "
+                "worth next_values.",
+                lambda r, v, n, f, t, g, lam: _batch_advantages(r, v, n, f | t, t, g, lam),
+            ),
+            Mistake(
+                "a fall treated as a time-out: after a fall nothing more is earned.",
+                lambda r, v, n, f, t, g, lam: _batch_advantages(r, v, n, f & False, f | t, g, lam),
+            ),
+            Mistake(
+                "an advantage that crosses a time-out: the next step belongs to a new episode.",
+                lambda r, v, n, f, t, g, lam: _batch_advantages(r, v, n, f, t & False, g, lam),
+            ),
+            Mistake(
+                "no normalisation: subtract the mean of all, and divide by their standard "
+                "deviation.",
+                lambda *case: _batch_advantages(*case, scaled="none"),
+            ),
+            Mistake(
+                "half a normalisation: divide by the standard deviation too.",
+                lambda *case: _batch_advantages(*case, scaled="mean"),
+            ),
+            Mistake(
+                "every robot normalised by itself: then a robot that did badly in all it did looks "
+                "like the others; mean and deviation are those of the whole batch.",
+                lambda *case: _batch_advantages(*case, scaled="robot"),
+            ),
+        ),
+        hints=(
+            "Go backwards over the steps, for all robots at once: every quantity of a step is an "
+            "array [n].",
+            "Two factors: 1 - fell[t] for what next_values[t] is worth, and 1 - (fell | "
+            "timed_out)[t] for the advantage that is carried.",
+            "(a - a.mean()) / a.std()",
         ),
     ),
 )

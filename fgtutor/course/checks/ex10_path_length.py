@@ -1,4 +1,4 @@
-"""Exercise 10, "Planning adapts": path length, SPL, and reading Table I (Sec. IV-A)."""
+"""Exercise 10, "Planning adapts": path length, SPL, and Table I (Sec. IV-A)."""
 
 import numpy as np
 
@@ -28,8 +28,8 @@ QUESTIONS = (
         name="path_length",
         points=2,
         title="how far did it walk?",
-        expects="the sum of the distances between consecutive positions, m: never shorter than the "
-        "straight line from first to last.",
+        expects="a length in metres, never shorter than the straight line from first to last; "
+        "along three sides of a square of 1 m it is 3 m.",
         draw=lambda rng: (np.cumsum(rng.normal(0.1, 0.2, (int(rng.integers(5, 20)), 2)), 0),),
         truth=lambda xy: _steps(xy).sum(),
         mistakes=(
@@ -41,7 +41,9 @@ QUESTIONS = (
                 "squared steps: the distance is the square ROOT of dx^2 + dy^2, for each step.",
                 lambda xy: (_steps(xy) ** 2).sum(),
             ),
-            Mistake("mean for sum: every step counts in full.", lambda xy: _steps(xy).mean()),
+            Mistake(
+                "a mean over the steps: every step counts in full.", lambda xy: _steps(xy).mean()
+            ),
             Mistake(
                 "the distance along the axes: |dx| + |dy| walks around the corner of every step.",
                 lambda xy: np.abs(np.diff(xy, axis=0)).sum(),
@@ -59,15 +61,15 @@ QUESTIONS = (
         name="spl",
         points=2,
         title="success weighted by path length",
-        expects="the mean over ALL trials of success * reference / max(length, reference): a "
-        "failure counts 0, a detour less, and no trial more than 1.",
+        expects="a mean over ALL trials, in which a failure counts 0, a success with a detour less "
+        "than 1, and no trial more than 1.",
         draw=_trials,
         truth=lambda success, length, reference: np.mean(
             np.where(success, np.minimum(reference / length, 1.0), 0.0)
         ),
         mistakes=(
             Mistake(
-                "failures that count: a trial that failed adds 0, however short its way was.",
+                "failures that count: a trial that failed adds 0, however short its walk was.",
                 lambda s, length, ref: np.mean(ref / np.maximum(length, ref)),
             ),
             Mistake(
@@ -80,11 +82,11 @@ QUESTIONS = (
                 lambda s, length, ref: np.mean(s * np.maximum(length, ref) / ref),
             ),
             Mistake(
-                "a forgotten max: a way shorter than the reference must not count more than 1.",
+                "a forgotten max: a walk shorter than the reference must not count more than 1.",
                 lambda s, length, ref: np.mean(s * ref / length),
             ),
             Mistake(
-                "the success rate: every success counts 1, whatever way it took.",
+                "the success rate: every success counts 1, however long its walk was.",
                 lambda s, length, ref: np.mean(s),
             ),
         ),
@@ -117,8 +119,7 @@ QUESTIONS = (
                 lambda: float(LENGTHS.mean()),
             ),
             Mistake(
-                "the last length for the reference of all: use each column's own length with its "
-                "own SPL.",
+                "the last length with every SPL: use each column's own length with its own SPL.",
                 lambda: float((9.73 * SPLS).mean()),
             ),
         ),

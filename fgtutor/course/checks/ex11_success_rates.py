@@ -1,9 +1,10 @@
-"""Exercise 11, "Mixed terrain": success tables with intervals, metres per policy (Sec. IV-B)."""
+"""Exercise 11, "Mixed terrain": success tables with intervals, a paired test (Sec. IV-B)."""
+
+import math
 
 import numpy as np
 
 from fgtutor.course.checks.question import Mistake, Question
-from fgtutor.directions import STEP_LENGTHS
 
 Z = 1.959963984540054
 REACHED, NO_ROUTE = 0, 1
@@ -59,26 +60,85 @@ def _of_planned(
     return _rates(terrain[kept], policy[kept], outcome[kept], terrains, policies)
 
 
-def _route(rng: np.random.Generator) -> tuple:
-    n = int(rng.integers(10, 25))
-    return rng.integers(8, size=n), rng.integers(3, size=n), 4, 0.1
+def _pairs(rng: np.random.Generator) -> tuple:
+    first = rng.uniform(size=50) < 0.8
+    second = np.where(rng.uniform(size=50) < 0.6, first, rng.uniform(size=50) < 0.6)
+    first[:4], second[:4] = (1, 1, 0, 0), (0, 0, 1, 0)
+    return first, second
 
 
-def _metres(
-    headings: np.ndarray, policies: np.ndarray, count: int, resolution: float
+def _sign_test(
+    first: np.ndarray, second: np.ndarray, sides: float = 2.0, ties: bool = False
+) -> tuple[int, int, float]:
+    """Count the outcomes of n fair coins by Pascal's triangle; `sides` and `ties` make it wrong."""
+    wins, losses = int((first & ~second).sum()), int((second & ~first).sum())
+    n, least = (len(first) if ties else wins + losses), min(wins, losses)
+    row = np.ones(1)
+    for _ in range(n):
+        row = np.append(row, 0.0) + np.append(0.0, row)
+    return wins, losses, float(min(sides * row[: least + 1].sum() / 2.0**n, 1.0))
+
+
+def _unlimited(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
+    wins, losses, half = _sign_test(first, second, sides=1.0)
+    return wins, losses, 2 * half
+
+
+def _point_test(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
+    wins, losses, _ = _sign_test(first, second)
+    n = wins + losses
+    return wins, losses, float(min(2 * math.comb(n, wins) / 2**n, 1.0))
+
+
+def _length(xy: np.ndarray) -> float:
+    return float(np.hypot(*np.diff(xy, axis=0).T).sum())
+
+
+def _walks(rng: np.random.Generator) -> tuple:
+    trials, count, longest = 14, 3, 8
+    xy = np.cumsum(rng.uniform(0.1, 1.0, (trials, longest, 2)), axis=1)
+    for trial, end in enumerate(rng.integers(4, longest + 1, trials)):
+        xy[trial, end:] = np.nan
+    xy[0] = np.nan
+    xy[0, :2] = (0, 0), (0, 1)  # shorter than its reference
+    checkpoint = np.append(np.arange(10) % 2, [0, 1, 0, 1])  # the last checkpoint was never tried
+    success = rng.uniform(size=trials) < 0.7
+    success[:4] = True, True, False, False
+    return checkpoint, success, xy, rng.uniform(1.5, 3, trials), count
+
+
+def _checkpoints(
+    checkpoint: np.ndarray,
+    success: np.ndarray,
+    xy: np.ndarray,
+    reference: np.ndarray,
+    count: int,
+    *,
+    every: bool = False,
+    capped: bool = True,
+    empty: float = np.nan,
+    of_successes: bool = False,
 ) -> np.ndarray:
-    return np.bincount(policies, STEP_LENGTHS[headings] * resolution, minlength=count)
+    """Make the rows one by one; the options make it wrong."""
+    lengths = np.array([_length(walk[~np.isnan(walk[:, 0])]) for walk in xy])
+    table = np.full((count, 3), empty)
+    for row in sorted(set(checkpoint.tolist())):
+        own = checkpoint == row
+        reached = own & success
+        share = reference / (np.maximum(lengths, reference) if capped else lengths)
+        spl = share[reached].mean() if of_successes else (share * success)[own].mean()
+        table[row] = lengths[own if every else reached].mean(), success[own].mean(), spl
+    return table
 
 
 QUESTIONS = (
     Question(
         id="ex11.q1",
         name="wilson_interval",
-        points=3,
+        points=1,
         title="how sure is a success rate?",
-        expects="(low, high) of the Wilson interval with z = 1.96: centre (p + z^2/2n) / (1 + "
-        "z^2/n), half width z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2 / 4n^2); within [0, 1], and "
-        "of some width even when every trial succeeded.",
+        expects="(low, high) of the Wilson interval with z = 1.96: within [0, 1], never without "
+        "width, and 0.84 to 1 for 20 successes of 20.",
         draw=_counts,
         truth=lambda successes, trials: _wilson(successes, trials),
         mistakes=(
@@ -93,7 +153,7 @@ QUESTIONS = (
                 _uncentred,
             ),
             Mistake(
-                "z = 1 for z = 1.96: one standard error covers 68 %, not 95 %.",
+                "z = 1 in place of 1.96: one standard error covers 68 %, not 95 %.",
                 lambda s, n: _wilson(s, n, 1.0),
             ),
             Mistake(
@@ -112,7 +172,7 @@ QUESTIONS = (
     Question(
         id="ex11.q2",
         name="success_table",
-        points=2,
+        points=1,
         title="Table II from raw trials",
         expects="table[terrain, policy] is the share of ALL trials of that pair whose outcome is 0 "
         "(reached); no route, a fall and a time-out are failures; NaN where nothing was tried.",
@@ -122,8 +182,8 @@ QUESTIONS = (
         ),
         mistakes=(
             Mistake(
-                "refusals left out: a planner that finds no route has failed too (outcome 1), or "
-                "one that only dares the easy trials would win.",
+                "refusals left out: no route (outcome 1) is a failure too, or a planner that "
+                "accepts only the easy trials would win.",
                 _of_planned,
             ),
             Mistake(
@@ -131,16 +191,16 @@ QUESTIONS = (
                 lambda t, p, o, nt, np_: _rates(t, p, o, nt, np_).T,
             ),
             Mistake(
-                "zeros for nothing tried: a rate of 0 says that it always failed; where nothing "
-                "was tried, NaN.",
+                "zeros where nothing was tried: a rate of 0 says that it always failed; where "
+                "nothing was tried, NaN.",
                 lambda t, p, o, nt, np_: np.nan_to_num(_rates(t, p, o, nt, np_)),
             ),
             Mistake(
-                "failures for successes: outcome 0 is `reached`.",
+                "failures counted: outcome 0 is `reached`.",
                 lambda t, p, o, nt, np_: 1 - _rates(t, p, o, nt, np_),
             ),
             Mistake(
-                "counts for rates: divide by the trials of that pair.",
+                "counts in place of rates: divide by the trials of that pair.",
                 lambda t, p, o, nt, np_: np.array(
                     [
                         [np.sum((t == i) & (p == j) & (o == 0)) for j in range(np_)]
@@ -156,48 +216,51 @@ QUESTIONS = (
     ),
     Question(
         id="ex11.q3",
-        name="metres_by_policy",
-        points=2,
-        title="who walked how far?",
-        expects="the metres of the route that each of `count` policies walks: a step along an axis "
-        "is `resolution` long, a diagonal one sqrt(2) times that; 0 for a policy without a step.",
-        draw=_route,
-        truth=lambda headings, policies, count, resolution: _metres(
-            headings, policies, count, resolution
+        name="paired_test",
+        points=3,
+        title="which planner is better, over the same grounds?",
+        expects="the trials that only the first one won, those that only the second one won, and "
+        "the probability that n fair coins, n the sum of both, fall at least as unevenly, to "
+        "either side; never above 1.",
+        draw=_pairs,
+        examples=(
+            (np.array([True, False, True]), np.array([True, False, True])),  # they never differ
+            (np.array([True, False, True]), np.array([False, True, True])),  # as often each
         ),
+        truth=lambda first, second: _sign_test(first, second),
         mistakes=(
             Mistake(
-                "steps for metres: that counts steps.",
-                lambda h, p, n, r: np.bincount(p, minlength=n),
+                "one side of the test: before the trials, either planner might have been the "
+                "better one: count both sides.",
+                lambda a, b: _sign_test(a, b, sides=1.0),
             ),
             Mistake(
-                "diagonals as short as the others: odd headings are diagonal: sqrt(2) cells long.",
-                lambda h, p, n, r: np.bincount(p, minlength=n) * r,
+                "draws counted: a ground that both cross, or none, says nothing about which is "
+                "better.",
+                lambda a, b: _sign_test(a, b, ties=True),
             ),
             Mistake(
-                "a forgotten resolution: STEP_LENGTHS counts cells; a cell is `resolution` metres.",
-                lambda h, p, n, r: _metres(h, p, n, 1.0),
+                "successes in place of wins: count the trials that ONLY this planner won.",
+                lambda a, b: (int(a.sum()), int(b.sum()), _sign_test(a, b)[2]),
             ),
             Mistake(
-                "diagonal and straight exchanged: heading 0 is +x: even headings lie along the "
-                "axes.",
-                lambda h, p, n, r: (
-                    _metres(h + 1, p, n, r) if h.max() < 7 else _metres((h + 1) % 8, p, n, r)
-                ),
+                "swapped counts: those that only the first one won come first.",
+                lambda a, b: (_sign_test(a, b)[1], _sign_test(a, b)[0], _sign_test(a, b)[2]),
             ),
             Mistake(
-                "shares for metres: it is divided by the whole length.",
-                lambda h, p, n, r: _metres(h, p, n, r) / _metres(h, p, n, r).sum(),
+                "a probability above 1: where both won as often, both sides hold the middle; limit "
+                "p to 1.",
+                _unlimited,
             ),
             Mistake(
-                "missing idle policies: a policy that never walks has 0 m: np.bincount needs "
-                "minlength=count.",
-                lambda h, p, n, r: _metres(h, p, 0, r),
+                "one outcome alone: not only this split, but every more uneven one counts.",
+                _point_test,
             ),
         ),
         hints=(
-            "fgtutor.directions.STEP_LENGTHS[headings] are the lengths in cells.",
-            "np.bincount(policies, weights=lengths, minlength=count) adds them up by policy.",
+            "first & ~second marks the trials that only the first one won.",
+            "The probability of exactly k heads of n fair coins is math.comb(n, k) / 2**n.",
+            "Sum it over k = 0 ... min(wins, losses), times 2, at most 1.",
         ),
     ),
     Question(
@@ -231,5 +294,51 @@ QUESTIONS = (
             "n / (n + z^2) > 0.99: solve for n, and round up.",
         ),
         rtol=1e-6,
+    ),
+    Question(
+        id="ex11.q5",
+        name="table_one",
+        points=3,
+        title="how an approach improves, from raw walks",
+        expects="row c holds, of the trials of checkpoint c, the mean length of the walks that "
+        "succeeded, the success rate, and SPL over all trials; NaN three times for a checkpoint "
+        "that was never tried; a walk ends where its positions become NaN.",
+        draw=_walks,
+        truth=lambda checkpoint, success, xy, reference, count: _checkpoints(
+            checkpoint, success, xy, reference, count
+        ),
+        mistakes=(
+            Mistake(
+                "lengths of failures: a walk that ended in a fall is short for the wrong reason; "
+                "average the successes.",
+                lambda *case: _checkpoints(*case, every=True),
+            ),
+            Mistake(
+                "an SPL over successes alone: a failure counts 0.",
+                lambda *case: _checkpoints(*case, of_successes=True),
+            ),
+            Mistake(
+                "a forgotten max: a walk shorter than its reference counts 1, not more.",
+                lambda *case: _checkpoints(*case, capped=False),
+            ),
+            Mistake(
+                "zeros for a checkpoint that was not tried: 0 would say that it always failed.",
+                lambda *case: _checkpoints(*case, empty=0.0),
+            ),
+            Mistake(
+                "columns in the wrong order: length, success rate, SPL.",
+                lambda *case: _checkpoints(*case)[:, [0, 2, 1]],
+            ),
+            Mistake(
+                "walks that go on after their end: NaN marks what was never walked; leave those "
+                "positions out.",
+                lambda c, s, xy, ref, n: _checkpoints(c, s, np.nan_to_num(xy), ref, n),
+            ),
+        ),
+        hints=(
+            "First the length of each walk: np.diff over axis 1, and np.nansum over the steps.",
+            "Then a loop over the checkpoints: own = checkpoint == c; skip it if not own.any().",
+            "SPL of a checkpoint is the mean of success * reference / max(length, reference).",
+        ),
     ),
 )

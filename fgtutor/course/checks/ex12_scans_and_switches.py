@@ -1,6 +1,7 @@
 """Exercise 12, "From a scan to a walk": rasters, localisation noise, switching (Sec. V)."""
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -9,24 +10,41 @@ from fgtutor.course.checks.question import Mistake, Question
 
 def _cloud(rng: np.random.Generator) -> tuple:
     nx, ny, resolution = 5, 4, float(rng.choice([0.05, 0.1]))
-    n = 30
-    cells = np.stack((rng.integers(nx, size=n), rng.integers(ny - 1, size=n)), axis=-1)
-    inside = (cells + rng.uniform(0.05, 0.95, (n, 2))) * resolution
-    return np.column_stack((inside, rng.uniform(-0.3, -0.05, n))), (nx, ny), resolution
+    # Per cell some points on one level; the last row of cells is empty.
+    cells = np.repeat(np.argwhere(np.ones((nx, ny - 1))), 3, axis=0)
+    level = np.repeat(rng.uniform(-0.3, -0.1, nx * (ny - 1)), 3)
+    z = level + rng.uniform(0, 0.02, len(level))
+    z[0] += 0.5  # a stray echo, alone up there
+    z[3:6] = -0.3, -0.2, -0.1  # three strays: no height has support
+    z[8] -= 0.5  # one below the ground
+    inside = (cells + rng.uniform(0.05, 0.95, cells.shape)) * resolution
+    points = np.column_stack((inside, z))
+    beside = np.array([[-0.4, 0.3, 1.0], [nx + 0.4, 0.3, 1.0], [0.3, ny + 0.4, 1.0]])
+    beside = np.repeat(beside, 2, axis=0) * (resolution, resolution, 1)
+    points = np.concatenate((points, beside))
+    return rng.permutation(points), (nx, ny), resolution, 2
 
 
 def _raster(
     points: np.ndarray,
     shape: tuple[int, int],
     resolution: float,
+    support: int,
+    *,
     empty: float = np.nan,
-    pick=np.max,
+    pick: Callable[[np.ndarray], float] = np.max,
+    clamp: bool = False,
 ) -> np.ndarray:
-    cells = np.floor(points[:, :2] / resolution).astype(int)
+    """Look at the points cell by cell; the options make it wrong."""
     heights = np.full(shape, empty)
-    for ix, iy in set(map(tuple, cells.tolist())):
-        inside = (cells == (ix, iy)).all(axis=-1)
-        heights[ix, iy] = pick(points[inside, 2])
+    cells = np.floor(points[:, :2] / resolution).astype(int)
+    if clamp:
+        cells = np.clip(cells, 0, np.array(shape) - 1)
+    for ix, iy in np.ndindex(shape):
+        z = points[(cells == (ix, iy)).all(axis=-1), 2]
+        held = [h for h in z if sum(abs(h - other) <= 0.05 for other in z) >= support]
+        if held:
+            heights[ix, iy] = pick(np.array(held))
     return heights
 
 
@@ -40,7 +58,7 @@ def _choices(rng: np.random.Generator) -> tuple:
 
 
 def _sequences(feasibility: np.ndarray) -> list[tuple[float, int]]:
-    """Every way to choose a policy for each step: what its steps cost, and its switches."""
+    """Every choice of a policy for each step: what its steps cost, and its switches."""
     steps, policies = feasibility.shape
     return [
         (
@@ -66,53 +84,72 @@ QUESTIONS = (
     Question(
         id="ex12.q1",
         name="rasterise",
-        points=2,
+        points=3,
         title="from a point cloud to a map",
-        expects="heights[ix, iy] is the HIGHEST point over the cell (the map's corner is (0, 0)), "
-        "and NaN where the scanner hit nothing.",
+        expects="heights[ix, iy] is the HIGHEST point over the cell that has at least `support` "
+        "points of its cell, itself among them, within 5 cm of its height; NaN where there is "
+        "none; points beside the map do not count.",
         draw=_cloud,
-        truth=lambda points, shape, resolution: _raster(points, shape, resolution),
+        truth=lambda points, shape, resolution, support: _raster(
+            points, shape, resolution, support
+        ),
         mistakes=(
             Mistake(
-                "mean for max: at the edge of a step, the mean is a height that is nowhere.",
-                lambda p, s, r: _raster(p, s, r, pick=np.mean),
+                "stray points believed: a single echo high above the others is no ground; ask for "
+                "`support` points.",
+                lambda p, s, r, n: _raster(p, s, r, 1),
             ),
             Mistake(
-                "the last point for the highest: heights[ix, iy] = z keeps whichever point came "
-                "last: use np.maximum.at.",
-                lambda p, s, r: _raster(p, s, r, pick=lambda z: z[-1]),
-            ),
-            Mistake(
-                "zeros for the unseen: an unknown cell is NaN: 0 would be free ground.",
-                lambda p, s, r: _raster(p, s, r, empty=0.0),
-            ),
-            Mistake(
-                "a floor at zero: all points here lie below 0: start from -infinity, not from "
-                "zeros.",
-                lambda p, s, r: np.where(np.isnan(_raster(p, s, r)), np.nan, 0.0),
-            ),
-            Mistake(
-                "swapped axes: the first index is ix: maps here are not images.",
-                lambda p, s, r: _raster(p[:, [1, 0, 2]], s[::-1], r),
+                "a mean of the points: at the edge of a step, the mean is a height that is "
+                "nowhere.",
+                lambda p, s, r, n: _raster(p, s, r, n, pick=np.mean),
             ),
             Mistake(
                 "the lowest point: a foot is stopped by the highest.",
-                lambda p, s, r: _raster(p, s, r, pick=np.min),
+                lambda p, s, r, n: _raster(p, s, r, n, pick=np.min),
+            ),
+            Mistake(
+                "zeros for what was not seen: an unknown cell is NaN; 0 would be free ground.",
+                lambda p, s, r, n: _raster(p, s, r, n, empty=0.0),
+            ),
+            Mistake(
+                "heights that start at zero: all ground here lies below 0, so a maximum with 0 "
+                "hides it.",
+                lambda p, s, r, n: np.maximum(_raster(p, s, r, n), 0.0),
+            ),
+            Mistake(
+                "points beside the map pushed into its border cells: leave them out.",
+                lambda p, s, r, n: _raster(p, s, r, n, clamp=True),
+            ),
+            Mistake(
+                "NaN that spreads: np.maximum(nan, z) is NaN; start from -inf, or fill in cell by "
+                "cell.",
+                lambda p, s, r, n: np.full(s, np.nan),
+            ),
+            Mistake(
+                "swapped axes: the first index is ix: maps here are not images.",
+                lambda p, s, r, n: _raster(p[:, [1, 0, 2]], s[::-1], r, n),
+            ),
+            Mistake(
+                "a point that does not count itself: `support` includes the point.",
+                lambda p, s, r, n: _raster(p, s, r, n + 1),
             ),
         ),
         hints=(
-            "Cells as in exercise 01: np.floor(xy / resolution).",
-            "np.maximum.at(heights, (ix, iy), z) keeps the highest, from an array of -np.inf.",
-            "What is still -inf at the end was never hit: make it NaN.",
+            "Cells as in exercise 01: np.floor(xy / resolution). Keep the points whose cell is on "
+            "the map.",
+            "For the heights z of one cell, np.abs(z[:, None] - z) <= 0.05 says which points lie "
+            "near which; its sum along an axis is the support of each.",
+            "A loop over np.unique(cells, axis=0) visits every cell that was hit.",
         ),
     ),
     Question(
         id="ex12.q2",
         name="localisation_std",
-        points=2,
+        points=1,
         title="how lost is the robot after t seconds?",
-        expects="sqrt(fix^2 + drift^2 t): a random walk's VARIANCE grows with time, and "
-        "independent errors add their variances.",
+        expects="a standard deviation in metres; a random walk's VARIANCE grows in proportion to "
+        "time, and independent errors add their variances.",
         draw=_noise,
         truth=lambda t, fix, drift: np.hypot(fix, drift * np.sqrt(t)),
         mistakes=(
@@ -122,13 +159,13 @@ QUESTIONS = (
                 lambda t, fix, drift: fix + drift * np.sqrt(t),
             ),
             Mistake(
-                "a drift that only ever grows one way: drift * t is a bias; a random walk gets as "
-                "far as drift * sqrt(t).",
+                "a drift that always goes in one direction: drift * t is a bias; a random walk "
+                "gets as far as drift * sqrt(t).",
                 lambda t, fix, drift: np.hypot(fix, drift * t),
             ),
             Mistake(
-                "a variance for a standard deviation: the root is missing: the answer is in "
-                "metres.",
+                "a variance in place of a standard deviation: the root is missing: the answer is "
+                "in metres.",
                 lambda t, fix, drift: fix**2 + drift**2 * t,
             ),
             Mistake(
@@ -148,7 +185,7 @@ QUESTIONS = (
     Question(
         id="ex12.q3",
         name="cheapest_with_switches",
-        points=3,
+        points=2,
         title="plan with a price on switching",
         expects="the smallest sum over the steps of 1 / F[step, policy of that step], plus "
         "switch_cost for every change of policy; the first policy is free.",
@@ -157,8 +194,8 @@ QUESTIONS = (
         truth=lambda feasibility, switch_cost: _cheapest(feasibility, switch_cost),
         mistakes=(
             Mistake(
-                "the greedy choice: the best policy at every step may switch to and fro; staying "
-                "can be cheaper.",
+                "the greedy choice: the best policy at every step may mean a switch at every step; "
+                "staying can be cheaper.",
                 _greedy,
             ),
             Mistake("free switching: the changes are not paid.", lambda f, s: _cheapest(f, 0.0)),
@@ -203,7 +240,7 @@ QUESTIONS = (
                 lambda: 0.80,
             ),
             Mistake(
-                "percent for a probability: a probability lies between 0 and 1.",
+                "percent in place of a probability: a probability lies between 0 and 1.",
                 lambda: 100 * 0.95 * 0.85,
             ),
             Mistake(

@@ -6,7 +6,9 @@ function itself: an answer with the same results has made it.
 """
 
 import copy
+import html
 import inspect
+import textwrap
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,13 +17,27 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from annotated_types import Interval
 
-from fgtutor.course.grading.answers import decode, describe, difference
+from fgtutor.course.grading.answers import (
+    arrays_of,
+    decode,
+    describe,
+    difference,
+    not_integers,
+)
 from fgtutor.course.grading.replies import CRASHED, NOT_STARTED, TOO_SLOW
 from fgtutor.errors import ConfigError
 from fgtutor.io.validation import CountOrZero, Seed, check_arguments, parse_record
 
 PASSED, WRONG = "passed", "wrong"
 OUTCOMES: tuple[str, ...] = (PASSED, NOT_STARTED, WRONG, CRASHED, TOO_SLOW)
+SIGNS: dict[str, str] = dict(
+    zip(OUTCOMES, "\N{CHECK MARK}\N{WHITE CIRCLE}\N{BALLOT X}\N{BALLOT X}\N{BALLOT X}", strict=True)
+)
+"""What stands before an outcome: a tick, a circle where nothing was tried, else a cross."""
+COLOURS: dict[str, str] = dict(
+    zip(OUTCOMES, ("#00795a", "#767676", "#b34700", "#b34700", "#b34700"), strict=True)
+)
+"""Colours of outcomes on white or black; the sign and the word say the same."""
 LONGEST = 5000
 """Most characters of a text that is shown; no path is longer."""
 CASES = 10
@@ -68,13 +84,46 @@ class Question:
     """Relative tolerance of an answer."""
     atol: float = 1e-8
     """Absolute tolerance of an answer."""
+    single: bool = True
+    """Whether an answer in float32 may be as far off as float32 is."""
+    integers: bool = False
+    """Whether the answer must be of an integer type."""
+    seconds: float = 0.0
+    """CPU time for all its cases, s, where the usual is not enough."""
+    harness: Callable[..., Any] | None = None
+    """Calls what the learner defines, a class or a training: harness(target, *arguments) gives the
+    answer. A plain `def` that does its imports inside and uses no other global: its source is sent
+    to the submission's process. The `truth` and the mistakes are then targets like the learner's.
+    """
+
+    @property
+    def parameters(self) -> list[str]:
+        """The names of a case's arguments."""
+        names = [*inspect.signature(self.harness or self.truth).parameters]
+        return names[1:] if self.harness else names
 
     @property
     def call(self) -> str:
-        """How the function is called: its name with its parameters."""
-        if self.draw is None:
+        """How the function is called: its name with its parameters; of other things, the name."""
+        if self.draw is None or self.harness:
             return self.name
-        return f"{self.name}({', '.join(inspect.signature(self.truth).parameters)})"
+        return f"{self.name}({', '.join(self.parameters)})"
+
+    @property
+    def harness_source(self) -> list[str] | None:
+        """The harness by name and source; None if there is none."""
+        if self.harness is None:
+            return None
+        return [self.harness.__name__, textwrap.dedent(inspect.getsource(self.harness))]
+
+    def answers(self, target: Callable[..., Any], cases: Sequence[tuple] | None) -> list[Any]:
+        """Return what a target answers to each case, without letting it touch the cases."""
+        with np.errstate(all="ignore"):
+            if cases is None:
+                return [target()]
+            called = (target,) if self.harness else ()
+            function = self.harness or target
+            return [arrays_of(function(*called, *copy.deepcopy(case))) for case in cases]
 
     def cases(self, seed: Seed = 0, cases: Cases = CASES) -> list[tuple] | None:
         """Return the arguments of every case; the same for one seed. None for a number to find.
@@ -115,24 +164,46 @@ class Verdict:
     """passed | not started | wrong | crashed | too slow"""
     detail: str = ""
     """Why, over one or more lines."""
+    case: int | None = None
+    """The first case that the answer fails in, from 1."""
 
     @property
     def points(self) -> int:
         """Points earned."""
         return self.question.points if self.outcome == PASSED else 0
 
+    @property
+    def head(self) -> str:
+        """A sign and a word: what became of which question."""
+        return f"{SIGNS[self.outcome]} {self.question.id} {self.question.title}: {self.outcome}"
+
     def __repr__(self) -> str:
-        """Read as a sentence, for a notebook cell's last line."""
-        head = f"{self.question.id} {self.question.title}: {self.outcome}"
-        return f"{head}\n{self.detail}" if self.detail else head
+        """Read as a sentence, for a terminal."""
+        return f"{self.head}\n{self.detail}" if self.detail else self.head
+
+    def _repr_html_(self) -> str:
+        """Return the same in colour, for a notebook; nothing in it is the learner's own HTML."""
+        colour = COLOURS[self.outcome]
+        return (
+            f'<div style="border-left: 5px solid {colour}; padding: 2px 10px">'
+            f'<b style="color: {colour}">{html.escape(self.head)}</b>'
+            f'<pre style="margin: 4px 0 0; white-space: pre-wrap">{html.escape(self.detail)}</pre>'
+            "</div>"
+        )
 
 
 class Judge:
     """Judges answers to one question over fixed cases, whose right answers are worked out once."""
 
-    def __init__(self, question: Question, cases: Sequence[tuple] | None) -> None:
-        self.question, self.cases = question, cases
-        self.right = answers_of(question.truth, cases)
+    def __init__(
+        self, question: Question, cases: Sequence[tuple] | None, *, tell: bool = True
+    ) -> None:
+        """Prepare to judge; with `tell` a wrong answer is told the property that a right one has.
+
+        That is often the formula itself, so a first try is better not told.
+        """
+        self.question, self.cases, self.tell = question, cases, tell
+        self.right = question.answers(question.truth, cases)
 
     def judge(self, reply: Mapping[str, Any]) -> Verdict:
         """Turn a reply of `replies.reply_of`, which may be forged or broken, into a verdict."""
@@ -149,56 +220,53 @@ class Judge:
             return Verdict(self.question, CRASHED, f"{len(answers)} answers to {len(self.right)}")
         for number, (expected, got) in enumerate(zip(self.right, answers, strict=True)):
             if text := self._difference(expected, got):
-                return Verdict(self.question, WRONG, self._wrong(number, text, answers))
+                case = None if self.cases is None else number + 1
+                return Verdict(self.question, WRONG, self._wrong(number, text, answers), case)
         return Verdict(self.question, PASSED)
 
     def _difference(self, expected: Any, got: Any) -> str:
         asked = self.question
         # Where a number is to be found, the message must not tell it.
         shown = asked.draw is not None
-        return difference(expected, got, rtol=asked.rtol, atol=asked.atol, show=shown)
+        options = {"rtol": asked.rtol, "atol": asked.atol, "single": asked.single}
+        text = difference(expected, got, show=shown, **options)
+        return text or (not_integers(got) if asked.integers else "")
 
     def _wrong(self, number: int, text: str, answers: Sequence[Any]) -> str:
-        lines = [f"Expected: {self.question.expects}"]
+        lines = self._told()
         mistake = self._recognise(answers)
         if mistake:
             lines.append(f"Looks like {mistake.says}")
         if self.cases is not None:
-            names = inspect.signature(self.question.truth).parameters
             given = ", ".join(
                 f"{name} = {_short(value)}"
-                for name, value in zip(names, self.cases[number], strict=True)
+                for name, value in zip(self.question.parameters, self.cases[number], strict=True)
             )
             lines.append(f"In case {number + 1} of {len(self.cases)}, with {given}:")
         return plain_text("\n".join([*lines, text]))
 
+    def _told(self) -> list[str]:
+        return [f"Expected: {self.question.expects}"] if self.tell else []
+
     def _changed(self, place: int) -> str:
-        names = list(inspect.signature(self.question.truth).parameters)
+        names = self.question.parameters
         name = names[place] if place < len(names) else "?"
-        return (
-            f"Expected: {self.question.expects}\n"
+        change = (
             f"The function changes its argument `{name}`, which belongs to the caller: work on a "
             f"copy, `{name} = {name}.copy()`."
         )
+        return "\n".join([*self._told(), change])
 
     def _recognise(self, answers: Sequence[Any]) -> Mistake | None:
         """Return the first typical mistake whose answers are these in every case."""
         for mistake in self.question.mistakes:
             try:
-                wrong = answers_of(mistake.answer, self.cases)
+                wrong = self.question.answers(mistake.answer, self.cases)
             except (ArithmeticError, LookupError, ValueError):
                 continue  # a mistake may not fit every case
             if not any(self._difference(a, b) for a, b in zip(wrong, answers, strict=True)):
                 return mistake
         return None
-
-
-def answers_of(function: Callable[..., Any], cases: Sequence[tuple] | None) -> list[Any]:
-    """Return what a function answers to each case, without letting it touch the cases."""
-    with np.errstate(all="ignore"):
-        if cases is None:
-            return [function()]
-        return [function(*copy.deepcopy(arguments)) for arguments in cases]
 
 
 def plain_text(text: Any, *, kept: str = "\n\\") -> str:

@@ -99,6 +99,8 @@ def confine(*, grader: int, memory_mb: int, cpu_seconds: float) -> list[str]:
     """
     in_force = _limit(memory_mb, cpu_seconds)
     if sys.platform == "linux":
+        if len(os.listdir("/proc/self/task")) > 1:  # the walls would stand around this one alone
+            os._exit(1)
         _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != grader:  # it ended before we asked to be told
             os._exit(1)

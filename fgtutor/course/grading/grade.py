@@ -1,6 +1,7 @@
 """Grading: from submitted notebooks to marks, one process per submission, none of them trusted.
 
-Reads .ipynb files and a seed; gives a `Mark` each, and on request a CSV, Gradescope's JSON and a
+Reads .ipynb files and what the checks keep (`mine.py`: one mark per exercise in it), and a seed;
+gives a `Mark` each, and on request a CSV, Gradescope's JSON and a
 report per learner. What a submission sends are answers, as plain JSON; right or wrong is decided
 here, against answers worked out here. Hidden cases follow from the seed: there is no secret file.
 """
@@ -39,7 +40,9 @@ from fgtutor.course.grading.submissions import (
     base_of,
     exercise_of,
     find_notebooks,
+    is_mine,
     learners_of,
+    read_mine,
     read_submission,
 )
 from fgtutor.errors import ConfigError, GradingError, NotebookError, StorageError
@@ -104,7 +107,9 @@ class Examiner:
             {
                 "id": judge.question.id,
                 "name": judge.question.name,
-                "cases": None if judge.cases is None else [encode(c) for c in judge.cases],
+                "cases": judge.cases and [encode(case, tensors=True) for case in judge.cases],
+                "harness": judge.question.harness_source,
+                "seconds": judge.question.seconds,
             }
             for judge in self.judges
         ]
@@ -161,13 +166,19 @@ def _skips(skipped: Mapping[Path, str]) -> list[str]:
 
 
 def _read(notebooks: Sequence[Path], config: GradeConfig) -> list[tuple[Mark, list[str]]]:
-    """Return for each notebook its code, and its mark so far: whose it is and what is wrong."""
+    """Return for each notebook its code, and its mark so far: whose it is and what is wrong.
+
+    A file of kept answers has one of each exercise that it holds something of.
+    """
     base = base_of(config.paths)
     read = []
     for path, (learner, doubt) in zip(
         notebooks, learners_of(notebooks, base, config.learner), strict=True
     ):
         mark, cells, said, damage = Mark(path=path, learner=learner), [], "", ""
+        if is_mine(path.name):
+            read += _read_mine(mark, doubt, config.exercise)
+            continue
         try:
             said, cells, damage = read_submission(path)
         except NotebookError as error:
@@ -182,6 +193,25 @@ def _read(notebooks: Sequence[Path], config: GradeConfig) -> list[tuple[Mark, li
         notes = tuple(filter(None, (damage, doubt)))
         read.append((replace(mark, notes=notes), cells))
     return read
+
+
+def _read_mine(mark: Mark, doubt: str, only: str) -> list[tuple[Mark, list[str]]]:
+    """Return for each exercise of a file of kept answers, or the `only` one, its mark and code."""
+    mark = replace(mark, exercise=only, notes=(doubt,) if doubt else ())
+    try:
+        kept = read_mine(mark.path)
+    except NotebookError as error:
+        return [(replace(mark, fault=str(error)), [])]
+    except OSError as error:
+        fault = f"{UNREADABLE}: {error.strerror or error}"
+        return [(replace(mark, fault=fault, not_run=True), [])]
+    if only and only not in kept:
+        return [(replace(mark, fault=f"it holds no answer of {only}"), [])]
+    return [
+        (replace(mark, exercise=exercise), cells)
+        for exercise, cells in kept.items()
+        if not only or exercise == only
+    ]
 
 
 def _grade(

@@ -98,8 +98,10 @@ def settle_clashes(marks: Sequence[Mark]) -> list[Mark]:
                 f"clash: {len(group)} notebooks for {exercise}, of which the best counts: {which}"
             )
             for mark in group:
-                settled[mark.path] = replace(mark, notes=(*mark.notes, note), counts=mark is best)
-    return [settled.get(mark.path, mark) for mark in marks]
+                settled[mark.path, exercise] = replace(
+                    mark, notes=(*mark.notes, note), counts=mark is best
+                )
+    return [settled.get((mark.path, mark.exercise), mark) for mark in marks]
 
 
 KEY = "  ".join(f"{sign} {outcome}" for outcome, sign in _SIGN.items())

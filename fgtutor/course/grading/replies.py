@@ -10,6 +10,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
 from typing import Any
 
@@ -59,11 +60,16 @@ def time_limit(seconds: float, patience: float = PATIENCE) -> Iterator[None]:
 
 
 def reply_of(
-    target: Any, cases: Sequence[tuple] | None, seconds: float, patience: float = PATIENCE
+    target: Any,
+    cases: Sequence[tuple] | None,
+    seconds: float,
+    patience: float = PATIENCE,
+    harness: Callable[..., Any] | None = None,
 ) -> dict[str, Any]:
     """Return {"answers": [...]}, encoded, or {"outcome": ..., "detail": ...}.
 
-    With `cases` None the target is itself the answer. "changed" counts the argument that the
+    With `cases` None the target is itself the answer. With a `harness` the target need not be a
+    function: harness(target, *arguments) gives the answer. "changed" counts the argument that the
     function modified although it is the caller's.
     """
     if target is ... or target is None:
@@ -76,7 +82,7 @@ def reply_of(
                 if not callable(target):
                     detail = f"a function is expected, not {target!r:.{LONGEST}}"
                     return {"outcome": CRASHED, "detail": detail}
-                return _call(target, cases)
+                return _call(partial(harness, target) if harness else target, cases)
             except NotImplementedError:
                 return {
                     "outcome": NOT_STARTED,

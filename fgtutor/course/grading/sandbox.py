@@ -9,6 +9,7 @@ CPU time and sleep, makes it overdue: a machine that keeps it waiting is an erro
 import importlib.util
 import json
 import os
+import re
 import selectors
 import signal
 import subprocess
@@ -43,6 +44,8 @@ SLACK = 2.0
 """CPU time after which a process is stopped that has not stopped itself, beside what it has, s."""
 TICK = 0.25
 """Seconds between two looks at what a process does."""
+TORCH = re.compile(r"^\s*(?:from|import)\b.*\btorch\b", re.MULTILINE)
+"""Code that needs torch, which is loaded before the process is confined."""
 ROOM = 20_000
 """Bytes for the answer to one case; the largest right one has 2,400."""
 
@@ -85,8 +88,10 @@ def ask_submission(
 ) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """Return a reply to every question, by id, and which protections were in force.
 
-    A question is {"id", "name", "cases"}, its cases encoded. A process that dies or hangs over one
-    question is started anew for those after it. Setting `stop` ends it all at once.
+    A question is {"id", "name", "cases"}, its cases encoded, and where it has them "harness", its
+    name and source, and "seconds", CPU time that it needs if that is more than usual. A process
+    that dies or hangs over one question is started anew for those after it. Setting `stop` ends it
+    all at once.
 
     Raises:
         GradingError: The machine did not let the submission run to its end, or `stop` was set.
@@ -103,8 +108,8 @@ def ask_submission(
                 detail = _blame(loaded, "running its cells")
                 return replies | {q["id"]: detail for q in pending}, in_force
             while pending:
-                reply = worker.receive(limits.seconds)
                 question = pending.pop(0)
+                reply = worker.receive(_seconds(question, limits))
                 if reply.get("question") == question["id"]:
                     replies[question["id"]] = reply
                 else:
@@ -112,6 +117,17 @@ def ask_submission(
                     break
         slept = worker.slept
     return replies, in_force
+
+
+def _seconds(question: dict[str, Any], limits: Limits) -> float:
+    """Return the CPU time that all cases of a question may take."""
+    return max(limits.seconds, question.get("seconds", 0.0))
+
+
+def needs_torch(cells: Sequence[str], questions: Sequence[dict[str, Any]]) -> bool:
+    """Return whether the cells, or what they are asked, use torch."""
+    asked = json.dumps([[q["cases"], q.get("harness")] for q in questions])
+    return '{"tensor":' in asked or "import torch" in asked or any(map(TORCH.search, cells))
 
 
 def _blame(message: dict[str, Any], doing: str) -> dict[str, Any]:
@@ -168,9 +184,11 @@ class _Worker:
         self.limits, self.stop, self.slept = limits, stop, slept
         cases = sum(len(q["cases"] or [0]) for q in questions)
         self.longest_line = 2 * LARGEST + ROOM * cases
-        self.used, self.usable = 0.0, limits.loading + len(questions) * (limits.seconds + 1) + SLACK
+        self.used = 0.0
+        self.usable = limits.loading + sum(_seconds(q, limits) + 1 for q in questions) + SLACK
         self.job = asdict(limits) | {
             "cells": list(cells),
+            "torch": needs_torch(cells, questions),
             "questions": list(questions),
             "longest_line": self.longest_line,
             "cpu_seconds": self.usable,

@@ -1,8 +1,9 @@
 """Submissions: which notebooks were handed in, whose each one is, and what code it holds.
 
-Reads folders and .ipynb files, none of them trusted; gives paths, names and the text of cells.
-Links are not followed and pipes not opened, so what is read was handed in. Names keep apart what
-differs: one learner under two names can be put together, two under one cannot be told apart.
+Reads folders, .ipynb files and what the checks keep (`mine.py`), none of them trusted; gives paths,
+names and the text of cells. Links are not followed and pipes not opened, so what is read was handed
+in. Names keep apart what differs: one learner under two names can be put together, two under one
+cannot be told apart.
 """
 
 import json
@@ -16,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 from fgtutor.course.checks import EXERCISES
 from fgtutor.course.checks.question import plain_name, plain_text
+from fgtutor.course.mine import sections_of
 from fgtutor.errors import ConfigError, NotebookError
 
 Rule = Literal["path", "file", "folder", "one"]
@@ -32,6 +34,8 @@ LINK = "a link, which is not followed: the file itself must be handed in"
 
 _ENDING = re.compile(r"\.ipynb(\.txt|\.json)?$", re.IGNORECASE)
 """How a notebook's name ends; browsers and mail programs add to it."""
+_MINE = re.compile(r"[ _.-]*(?<![^\W_])mine(?![^\W_])[ _.-]*", re.IGNORECASE)
+"""What marks a file of kept answers, beside its ending."""
 _EXERCISE = re.compile(r"[ _.-]*(?<![^\W_])(ex[0-9]{2})(?![^\W_])[ _.-]*", re.IGNORECASE)
 """The exercise in a name, between anything but letters and digits."""
 _COPY = re.compile(r"\(\d{1,3}\)|(?<![^\W_])copy( of|[ _]?\d{0,3})(?![^\W_])", re.IGNORECASE)
@@ -107,7 +111,16 @@ def _not_a_notebook(name: str) -> str:
         return "macOS's data on another file"
     if _ENDING.search(name):
         return ""
-    return "an archive: unpack it first" if _ARCHIVE.search(name) else "no notebook (.ipynb)"
+    if is_mine(name):
+        return ""
+    if _ARCHIVE.search(name):
+        return "an archive: unpack it first"
+    return "no notebook (.ipynb) and no mine.py"
+
+
+def is_mine(name: str) -> bool:
+    """Return whether a file is one of kept answers by its name: mine.py, ada_mine.py and so on."""
+    return name.lower().endswith(".py") and bool(_MINE.search(name[:-3]))
 
 
 # Whose --------------------------------------------------------------------------------------------
@@ -132,7 +145,7 @@ def learners_of(notebooks: Sequence[Path], base: Path, rule: Rule) -> list[tuple
     alike: dict[str, set[str]] = defaultdict(set)
     for notebook in notebooks:
         folders = [left for part in _folders(notebook, base) if (left := _without_exercise(part))]
-        own = _COPY.sub("", _ENDING.sub("", notebook.name))
+        own = _COPY.sub("", _without_ending(notebook.name))
         own = _without_exercise(own).strip(" _-.")
         parts = {
             "path": [*folders, *([own] if own and [own] != folders[-1:] else [])],
@@ -153,6 +166,11 @@ def learners_of(notebooks: Sequence[Path], base: Path, rule: Rule) -> list[tuple
         )
         for learner, own in named
     ]
+
+
+def _without_ending(name: str) -> str:
+    """Return a file's name without what says that it is a notebook or one of kept answers."""
+    return _MINE.sub("_", name[:-3]) if is_mine(name) else _ENDING.sub("", name)
 
 
 def _folders(notebook: Path, base: Path) -> tuple[str, ...]:
@@ -177,7 +195,7 @@ def exercise_of(notebook: Path, base: Path, metadata: str) -> str:
     folders = [names for part in _folders(notebook, base) if (names := _exercises_in(part))]
     said = {
         "its metadata": {metadata} & {*EXERCISES},
-        "its name": _exercises_in(_ENDING.sub("", notebook.name)),
+        "its name": _exercises_in(_without_ending(notebook.name)),
         "its folder": folders[-1] if folders and len(folders[-1]) == 1 else set(),
     }
     different = set().union(*said.values())
@@ -203,15 +221,7 @@ def read_submission(path: Path) -> Content:
         NotebookError: It is no notebook, or larger than any.
         OSError: The system does not let us read it, which is no fault of its own.
     """
-    mode = path.lstat().st_mode
-    if stat.S_ISLNK(mode):
-        raise NotebookError(f"not read: {LINK}")
-    if not stat.S_ISREG(mode):
-        raise NotebookError("not read: no file, but a pipe, a device or the like")
-    with path.open("rb") as file:
-        data = file.read(LARGEST_NOTEBOOK + 1)
-    if len(data) > LARGEST_NOTEBOOK:
-        raise NotebookError(f"larger than {LARGEST_NOTEBOOK} bytes: clear its outputs")
+    data = _read(path)
     try:
         notebook = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -251,6 +261,44 @@ def read_submission(path: Path) -> Content:
     more = f" and {len(damage) - 3} more" * (len(damage) > 3)
     said = f"damaged: {', '.join(damage[:3])}{more}" if damage else ""
     return Content(exercise if isinstance(exercise, str) else "", cells, said)
+
+
+def read_mine(path: Path) -> dict[str, list[str]]:
+    """Return what a file of kept answers holds, by exercise: each answer is a cell.
+
+    Whether an answer was changed since it passed does not matter, as it is asked again.
+
+    Raises:
+        NotebookError: It holds no answer, or is no text, or larger than any.
+        OSError: The system does not let us read it, which is no fault of its own.
+    """
+    try:
+        text = _read(path).decode("utf-8").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise NotebookError("not a readable mine.py: it is no text") from error
+    if len(text) > LARGEST_CODE:
+        raise NotebookError(f"more than {LARGEST_CODE} characters of code: hand in less")
+    found: dict[str, list[str]] = {}
+    for question, source in sections_of(text).items():
+        found.setdefault(question.partition(".")[0], []).append(source)
+    kept = {exercise: found[exercise] for exercise in EXERCISES if exercise in found}
+    if not kept:
+        raise NotebookError("no answer in it: hand in the mine.py that `check` has written")
+    return kept
+
+
+def _read(path: Path) -> bytes:
+    """Return the bytes of a file that was handed in itself; raises as `read_submission`."""
+    mode = path.lstat().st_mode
+    if stat.S_ISLNK(mode):
+        raise NotebookError(f"not read: {LINK}")
+    if not stat.S_ISREG(mode):
+        raise NotebookError("not read: no file, but a pipe, a device or the like")
+    with path.open("rb") as file:
+        data = file.read(LARGEST_NOTEBOOK + 1)
+    if len(data) > LARGEST_NOTEBOOK:
+        raise NotebookError(f"larger than {LARGEST_NOTEBOOK} bytes: clear its outputs")
+    return data
 
 
 def _brief(value: Any) -> str:

@@ -8,14 +8,17 @@ Sec. III-A; physics and observations are the environments', as in `execution`.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from matplotlib.colors import to_rgb
 
 from fgtutor.directions import NUM_HEADINGS
 from fgtutor.errors import ConfigError
 from fgtutor.execution import Episode
+from fgtutor.figures.style import policy_colours
 from fgtutor.figures.toy_film import ToyFilm
 from fgtutor.planning import plan
 from fgtutor.robots import env_class
@@ -24,6 +27,18 @@ from fgtutor.specialist import Specialist
 from fgtutor.world.terrain import Terrain, World
 
 Render = Callable[[LocomotionEnv], UInt8[np.ndarray, "height width 3"]]
+
+
+@runtime_checkable
+class Coated(Protocol):
+    """A way to draw a robot whose hull has a colour that can be changed."""
+
+    coat: tuple[float, float, float]
+    """Colour of the hull: red, green, blue, from 0 to 1."""
+
+    def __call__(self, env: LocomotionEnv) -> UInt8[np.ndarray, "height width 3"]:
+        """Draw robot 0."""
+        ...
 
 
 class Drive:
@@ -47,8 +62,10 @@ class Drive:
 
         Args:
             terrain: The ground.
-            zoo: The policies to choose from, all of one robot; the first acts first.
-            render: Draws robot 0 of an environment. None draws the toy's side view.
+            zoo: The policies to choose from, all of one robot. That of the terrain's name acts
+                first, if there is one, else the first.
+            render: Draws robot 0 of an environment, the hull in the colour of the policy that acts
+                if it is `Coated`. None draws the toy's side view.
             yaw: Heading at the start, rad.
 
         Raises:
@@ -68,7 +85,7 @@ class Drive:
         config = replace(robot.episodes, train=False, stuck_seconds=math.inf, history=history)
         self.env = robot(World([[terrain]]), 1, config=config)
         self.terrain, self.zoo, self._render, self._yaw = terrain, dict(zoo), render, yaw
-        self.policy, self.turn = next(iter(zoo)), 0.0
+        self.policy, self.turn = terrain.name if terrain.name in zoo else next(iter(zoo)), 0.0
         self.speed = self.zoo[self.policy].command[0]
         self.top_speed, self.top_turn = 1.5 * config.speed[1], config.max_turn_rate
         """What the sliders reach: half more than was trained, so that the limit can be felt."""
@@ -134,6 +151,8 @@ class Drive:
     def frame(self) -> UInt8[np.ndarray, "height width 3"]:
         """Return a picture of the robot as it stands."""
         if self._render is not None:
+            if isinstance(self._render, Coated):
+                self._render.coat = to_rgb(policy_colours([*self.zoo])[self.policy])
             return np.asarray(self._render(self.env))
         episode = self.episode
         # The film colours policies by the names of a route: one that stays where it starts.

@@ -1,7 +1,8 @@
 """Painting heights, and seeing which feasibilities follow: only those whose patch was touched.
 
-Reads a map and one specialist; gives f, L_recon and F of the painted map. A stroke assesses the
-tiles whose patches see it, not the map (`reassess`). Source: paper, Sec. III-B (a patch is local).
+Reads a map and one specialist, and where wanted a start and a goal; gives f, L_recon and F of the
+painted map, the route over it, and the drive along that route. A stroke assesses the tiles whose
+patches see it, not the map (`reassess`). Source: paper, Sec. III-B (a patch is local).
 """
 
 import math
@@ -14,19 +15,31 @@ from scipy.ndimage import find_objects
 from fgtutor.course.widgets.panels import (
     Cell,
     Panel,
+    Point,
     Scene,
     cell_table,
     check_cell,
     feasibility_picture,
     ground_picture,
+    on_picture,
 )
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.figures.style import policy_colours
+from fgtutor.execution import Episode, FollowConfig, execute
+from fgtutor.figures.style import INK, Photo, policy_colours
+from fgtutor.figures.videos import film_strip
+from fgtutor.planning import plan
+from fgtutor.routes import Refusal, Route
 from fgtutor.specialist import Specialist
 from fgtutor.tensorization import Assessment, Taus, assess, reassess
+from fgtutor.world.terrain import Terrain
 
 Window = tuple[slice, slice]
+FOLLOW = FollowConfig(patience=1.5, grace=2.0)
+"""How a painted route is driven: who is stuck is not waited for."""
+SMALL = 0.6
+"""A stroke that more than this share of the cells sees lies on a map too small to show that the
+rest stays as it was."""
 
 
 class Painting:
@@ -39,11 +52,22 @@ class Painting:
         *,
         taus: Taus = "calibrated",
         f_min: float = 0.1,
+        start: Point | None = None,
+        goal: Point | None = None,
     ) -> None:
         """Assess the whole map once; cells that were never observed become ground as filled.
 
-        Raises `ThresholdError` for taus that cannot be used.
+        With `start` and `goal`, (x, y) in m, a route is planned after every stroke.
+
+        Raises:
+            ConfigError: There is a start without a goal, or a goal without a start.
+            OffMapError: Start or goal is off the map.
+            ThresholdError: The taus cannot be used.
         """
+        if (start is None) != (goal is None):
+            raise ConfigError("a route needs a start and a goal: give both of them, or neither")
+        self.ends = None if start is None or goal is None else (start, goal)
+        """Start and goal (x, y), m, if a route is planned."""
         self.specialist, self.f_min = specialist, f_min
         self._taus: Taus = taus
         self._blank = elevation.filled().heights
@@ -60,6 +84,7 @@ class Painting:
         """f and L_recon of the painted map."""
         self.window: Window | None = None
         """The rectangle around the cells whose patches see the last stroke."""
+        self._plan()
 
     def stroke(self, cells: Sequence[Cell], height: float, radius: float) -> Window | None:
         """Set the ground within `radius` (m) of each cell's centre to `height` (m).
@@ -84,7 +109,49 @@ class Painting:
         name = self.specialist.name
         said, seen = reassess({name: self.assessment}, self.elevation)
         self.assessment, self.window = said[name], next(iter(find_objects(seen.astype(int))), None)
+        self._plan()
         return self.window
+
+    def _plan(self) -> None:
+        """Plan over the map as it is; a drive over the map as it was is forgotten."""
+        self.answer: Route | Refusal | None = None
+        """The cheapest route, or why there is none; None without start and goal."""
+        self.episode: Episode | None = None
+        """How the robot drove that route."""
+        if self.ends is None:
+            return
+        F, (start, goal) = self.assessment.weighted(), self.ends
+        self.answer = plan(
+            F,
+            np.zeros(F.shape, dtype=int),
+            grid=self.elevation,
+            start=start,
+            goal=goal,
+            names=(self.specialist.name,),
+            f_min=self.f_min,
+        )
+
+    def drive(self) -> Episode:
+        """Drive the route, and return what came of it.
+
+        Raises `ConfigError` without start and goal, and the reason, a `PlanningError`, if there is
+        no route.
+        """
+        if self.ends is None or self.answer is None:
+            raise ConfigError("a drive needs a route: give the painting a start and a goal")
+        terrain, name = self._terrain(self.ends), self.specialist.name
+        self.episode = execute(self.answer, terrain, {name: self.specialist}, config=FOLLOW)
+        return self.episode
+
+    def strip(self) -> Photo:
+        """Return four moments of the drive; raises `ConfigError` before it."""
+        if self.ends is None or self.episode is None or not isinstance(self.answer, Route):
+            raise ConfigError("nothing was driven on this map yet: drive first")
+        return film_strip(self.episode, self._terrain(self.ends), self.answer, count=4)
+
+    def _terrain(self, ends: tuple[Point, Point]) -> Terrain:
+        """Return the painted map as ground to drive on."""
+        return Terrain.from_elevation(self.elevation, *ends, robot=self.specialist.robot)
 
     def _map(self, heights: np.ndarray) -> ElevationMap:
         """Return heights as a map in its place, with every cell known."""
@@ -106,6 +173,14 @@ class Painting:
             ix, iy = self.window
             cells = (ix.stop - ix.start) * (iy.stop - iy.start)
             said += f"; {cells} of {nx * ny} cells see the last stroke"
+            if cells > SMALL * nx * ny:
+                said += " (this map is hardly larger than what a patch sees)"
+        if isinstance(self.answer, Refusal):
+            said += f"; no route: {self.answer.reason}"
+        elif self.answer is not None:
+            said += f"; route: {self.answer.length:.2f} m, cost {self.answer.cost:.2f}"
+        if self.episode is not None:
+            said += f"; driven: {self.episode.reason} after {self.episode.seconds:.1f} s"
         return said
 
     def _way(self, otherwise: str) -> str:
@@ -122,23 +197,33 @@ class Painting:
         return cell_table(self.elevation, cell, part.headings, rows)
 
     def scene(self) -> Scene:
-        """Draw M and F side by side, the window of the last stroke outlined."""
+        """Draw M and F side by side: the window of the last stroke, the route, and the drive."""
         name, ny = self.specialist.name, self.elevation.shape[1]
+        colour = policy_colours([name])[name]
         box = None
         if self.window is not None:
             ix, iy = self.window
             box = (float(ix.start), float(ny - iy.stop), float(ix.stop), float(ny - iy.start))
+        lines = []
+        if isinstance(self.answer, Route) and len(self.answer.cells) > 1:
+            lines.append((colour, on_picture(self.answer.cells, ny)))
+        if self.episode is not None:
+            lines.append((INK, self._placed(self.episode.poses[:, :2])))
+        drive = "; black: the drive" if self.episode is not None else ""
+        ends = zip(("start", "goal"), self.ends or (), strict=False)
         return Scene(
             rows=(
                 (
                     Panel(
-                        key="M", title="Elevation map M: paint here", caption="blue low, brown high"
+                        key="M",
+                        title="Elevation map M: paint here",
+                        caption=f"blue low, brown high{drive}",
                     ),
                     Panel(
                         key="F",
                         title=f"F of {name}, {self._way('best heading')}",
                         caption="yellow: feasible; dark: closed; the frame: sees the last stroke",
-                        colour=policy_colours([name])[name],
+                        colour=colour,
                     ),
                 ),
             ),
@@ -146,6 +231,14 @@ class Painting:
                 "M": ground_picture(self.elevation),
                 "F": feasibility_picture(self.shown, self.elevation.known, self.f_min),
             },
+            lines=lines,
+            marks={role: self._placed(np.array([point]))[0] for role, point in ends},
             box=box,
+            extent=self.elevation.extent,
             status=self.status,
         )
+
+    def _placed(self, points: Float[np.ndarray, "n 2"]) -> list[Point]:
+        """Return where points (x, y), m, lie in a picture, (right, down), in cells."""
+        across = (points - np.array(self.elevation.origin)) / self.elevation.resolution
+        return [(u, self.elevation.shape[1] - v) for u, v in across.tolist()]

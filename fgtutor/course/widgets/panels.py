@@ -18,12 +18,16 @@ from matplotlib.colors import to_rgb
 from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
-from fgtutor.figures.maps import BLOCKED, UNKNOWN, relief
+from fgtutor.figures.maps import BLOCKED
+from fgtutor.figures.panels import UNKNOWN
+from fgtutor.figures.relief import relief
 
 Cell = tuple[int, int]
 Point = tuple[float, float]
-CIVIDIS = matplotlib.colormaps["cividis"]
-"""Colours of F: they differ in brightness too, so the colour-blind read them alike."""
+Box = tuple[float, float, float, float]
+"""A rectangle (left, top, right, bottom), in cells."""
+VIRIDIS = matplotlib.colormaps["viridis"]
+"""Colours of F, as in every figure; they differ in brightness too, for the colour-blind."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +44,24 @@ class Panel:
     """Colour of the title, "#RRGGBB", where the picture belongs to one policy."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Chart:
+    """How the losses of one policy are spread on the map, and the weight that each loss gets."""
+
+    title: str
+    """What it is."""
+    colour: str
+    """Colour of the policy, "#RRGGBB"."""
+    span: tuple[float, float]
+    """The axis: log10 of the lowest and of the highest L_recon."""
+    shares: Sequence[float]
+    """Share of the map's patches in each bin, the bins evenly spread over the span."""
+    weights: Sequence[float]
+    """w_ood at losses evenly spread over the span, both ends included."""
+    home: Sequence[float] = ()
+    """log10 of the losses below which lie half, 9 of 10 and 99 of 100 patches of its own ground."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
     """Everything a view draws."""
@@ -52,8 +74,14 @@ class Scene:
     """Polylines over every panel: a colour and points (right, down), in cells."""
     marks: Mapping[str, Point] = field(default_factory=dict)
     """Where "start" and "goal" lie."""
-    box: tuple[float, float, float, float] | None = None
-    """A rectangle (left, top, right, bottom) to outline, in cells."""
+    box: Box | None = None
+    """A rectangle to outline."""
+    hatched: Sequence[Box] = ()
+    """Rectangles of cells that were never observed."""
+    extent: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    """Corners (x0, y0, x1, y1) of the map, m."""
+    charts: Sequence[Chart] = ()
+    """Below the panels, one for each policy."""
     legend: Mapping[str, str] = field(default_factory=dict)
     """Colours by name."""
     status: str = ""
@@ -82,14 +110,30 @@ def feasibility_picture(
     best: Float[np.ndarray, "nx ny"], known: Bool[np.ndarray, "nx ny"], f_min: float
 ) -> UInt8[np.ndarray, "ny nx 3"]:
     """Colour F, one number per cell; dark where it is below `f_min`."""
-    colours = CIVIDIS(best)[..., :3]
+    return picture(feasibility_colours(best, f_min), known)
+
+
+def feasibility_colours(
+    best: Float[np.ndarray, "nx ny"], f_min: float
+) -> Float[np.ndarray, "nx ny 3"]:
+    """Return the colour of each cell's F; dark where it is below `f_min`."""
+    colours = VIRIDIS(best)[..., :3]
     colours[best < f_min] = to_rgb(BLOCKED)
-    return picture(colours, known)
+    return colours
 
 
 def ground_picture(elevation: ElevationMap) -> UInt8[np.ndarray, "ny nx 3"]:
     """Colour the heights of a map as `figures.maps.draw_elevation` does."""
     return picture(relief(elevation)[0], elevation.known)
+
+
+def unknown_boxes(elevation: ElevationMap) -> list[Box]:
+    """Return the cells that were never observed, as runs along the rows of the picture."""
+    boxes = []
+    for row, unknown in enumerate(upright(~elevation.known)):
+        edges = np.flatnonzero(np.diff(unknown.astype(int), prepend=0, append=0))
+        boxes += [(float(a), float(row), float(b), row + 1.0) for a, b in edges.reshape(-1, 2)]
+    return boxes
 
 
 def check_cell(elevation: ElevationMap, cell: Cell) -> None:

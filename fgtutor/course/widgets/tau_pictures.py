@@ -1,7 +1,8 @@
 """How an `Explorer` looks: the scene of its widget, and a picture for pages without a kernel.
 
-Reads an `Explorer`; gives a `Scene` of M, F_max, P and every policy's w_ood with the route on top,
-or one figure with loose, paper and strict taus side by side. Source: the figures' own colours.
+Reads an `Explorer`; gives a `Scene` of M, F_max, P and every policy's w_ood with the route on top
+and the spread of its L_recon below, or one figure with loose, paper and strict taus side by side.
+Source: the figures' own colours.
 """
 
 import itertools
@@ -14,6 +15,7 @@ from matplotlib.patches import Patch
 
 from fgtutor.course.widgets.explorer import Explorer
 from fgtutor.course.widgets.panels import (
+    Chart,
     Panel,
     Point,
     Scene,
@@ -21,10 +23,12 @@ from fgtutor.course.widgets.panels import (
     ground_picture,
     on_picture,
     picture,
+    unknown_boxes,
 )
-from fgtutor.feasibility import TAU_HIGH, TAU_LOW
+from fgtutor.feasibility import TAU_HIGH, TAU_LOW, ood_weight
 from fgtutor.figures.maps import BLOCKED, draw_policy_map, draw_route, draw_weight
 from fgtutor.figures.style import TITLE, Picture, policy_colours
+from fgtutor.tensorization import Assessment
 
 TAU_CHOICES = {
     "loose": (5 * TAU_LOW, 5 * TAU_HIGH),
@@ -32,6 +36,10 @@ TAU_CHOICES = {
     "strict": (TAU_LOW / 5, TAU_HIGH / 5),
 }
 """The paper's thresholds, five times looser and five times stricter, for `tau_figure`."""
+BINS = 48
+"""Bars of the spread of L_recon."""
+HOME = ("0.5", "0.9", "0.99")
+"""Which quantiles of a policy's own ground are shown below them."""
 PANELS = (
     Panel(key="M", title="Elevation map M", caption="blue: below the usual ground; brown: above"),
     Panel(key="F", title="F_max, best heading", caption="yellow: feasible; dark: no way out"),
@@ -49,6 +57,14 @@ class TauPictures:
         self.colours = policy_colours(explorer.names)
         self._ground = ground_picture(explorer.elevation)
         self._palette = np.array([to_rgb(colour) for colour in self.colours.values()])
+        self._hatched = unknown_boxes(explorer.elevation)
+        losses = [one.reconstruction.numpy() for one in explorer.assessments.values()]
+        both = np.quantile(np.stack(losses), (0.002, 0.998))
+        self._span = (
+            float(np.log10(np.clip(both[0], 1e-3, TAU_LOW / 2))),
+            float(np.log10(max(both[1], 2 * TAU_HIGH))),
+        )
+        self._shares = [self._spread(one) for one in losses]
 
     def scene(self) -> Scene:
         """Draw the explorer as it stands."""
@@ -67,15 +83,16 @@ class TauPictures:
         for colour, (name, weight) in zip(
             self._palette, explorer.plan.weights.items(), strict=True
         ):
-            key = f"w {name}"
+            key, drives = f"w {name}", name in explorer.policies
             mean = weight.mean(dim=-1, keepdim=True).numpy()
-            pictures[key] = picture(1 - mean * (1 - colour), known)
+            shown = colour if drives else np.full(3, 0.6)
+            pictures[key] = picture(1 - mean * (1 - shown), known)
             weights.append(
                 Panel(
                     key=key,
-                    title=f"w_ood of {name}",
-                    caption="colour: seen before; white: never",
-                    colour=self.colours[name],
+                    title=f"w_ood of {name}" + ("" if drives else ", taken away"),
+                    caption="colour: seen before; white: never" if drives else "may not drive",
+                    colour=self.colours[name] if drives else "#999999",
                 )
             )
         return Scene(
@@ -88,7 +105,37 @@ class TauPictures:
             },
             legend=self.colours | {"blocked": BLOCKED},
             status=explorer.status,
+            hatched=self._hatched,
+            extent=explorer.elevation.extent,
+            charts=[
+                Chart(
+                    title=f"L_recon of {name} on this map",
+                    colour=self.colours[name] if name in explorer.policies else "#999999",
+                    span=self._span,
+                    shares=shares,
+                    weights=self._ramp(one),
+                    home=_home(one),
+                )
+                for (name, one), shares in zip(
+                    explorer.assessments.items(), self._shares, strict=True
+                )
+            ],
         )
+
+    def _spread(self, losses: np.ndarray) -> list[float]:
+        """Return the share of the known cells' losses in each bin; the outer bins hold the rest."""
+        known = np.log10(np.maximum(losses[self.explorer.elevation.known], 1e-12))
+        counts = np.histogram(np.clip(known, *self._span), BINS, self._span)[0]
+        return (counts / counts.sum()).tolist()
+
+    def _ramp(self, assessment: Assessment) -> list[float]:
+        """Return the weight of losses along the span, by the thresholds in force."""
+        losses = torch.logspace(*self._span, BINS + 1)
+        taus, score = self.explorer.settings.taus, assessment.score
+        if taus == "calibrated":
+            # What a loss is worth by itself: nothing is strange about the patch besides.
+            return score.weight(losses, torch.zeros_like(losses)).tolist()
+        return ood_weight(losses, *((TAU_LOW, TAU_HIGH) if taus == "paper" else taus)).tolist()
 
     def _on_picture(self, cells: object) -> list[Point]:
         return on_picture(np.asarray(cells), self.explorer.elevation.shape[1])
@@ -104,6 +151,13 @@ class TauPictures:
             (self.colours[route.names[policies[a]]], points[a : b + 1])
             for a, b in itertools.pairwise(cuts)
         ]
+
+
+def _home(assessment: Assessment) -> list[float]:
+    """Return log10 of the losses that a policy's own ground has, where it was calibrated."""
+    specialist = assessment.specialist
+    known = specialist.quantiles if specialist else {}
+    return [float(np.log10(known[level])) for level in HOME if level in known]
 
 
 def tau_figure(

@@ -29,6 +29,87 @@ function cellsAsImage(view, [nx, ny]) {
   return small;
 }
 
+// About `count` round numbers between two ends: 1, 2 or 5 times a power of ten apart.
+function ticks(low, high, count) {
+  const rough = (high - low) / count;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = power * [1, 2, 5, 10].find((factor) => factor * power >= rough);
+  const found = [];
+  for (let i = Math.ceil(low / step - 1e-9); i * step <= high + 1e-9 * step; i += 1) {
+    found.push(Number((i * step).toPrecision(6)));
+  }
+  return found;
+}
+
+// Numbers along an edge of a picture; `side` is the style property that they are placed by.
+function label(axis, low, high, count, side) {
+  axis.replaceChildren();
+  for (const value of ticks(low, high, count)) {
+    const text = make("span", "fgtutor-tick", axis);
+    text.textContent = String(value);
+    text.style[side] = `${(100 * (value - low)) / (high - low)}%`;
+  }
+}
+
+// Slanted lines over the cells that were never observed.
+function hatch(context, boxes, scale, dots) {
+  if (!boxes.length) return;
+  context.save();
+  context.beginPath();
+  for (const [left, top, right, bottom] of boxes) {
+    context.rect(left * scale, top * scale, (right - left) * scale, (bottom - top) * scale);
+  }
+  context.clip();
+  const { width, height } = context.canvas;
+  context.beginPath();
+  for (let u = -height; u < width; u += 7 * dots) {
+    context.moveTo(u, height);
+    context.lineTo(u + height, 0);
+  }
+  context.lineWidth = 1.2 * dots;
+  context.strokeStyle = "#5a5a5a";
+  context.stroke();
+  context.restore();
+}
+
+// How L_recon is spread (bars, roots of shares: much is flat and would dwarf the rest), what weight it gets (line), and the policy's own ground (bar below).
+function drawChart(canvas, { colour, span, shares, weights, home }) {
+  const dots = window.devicePixelRatio || 1;
+  canvas.width = Math.max(1, Math.round(canvas.clientWidth * dots));
+  canvas.height = Math.max(1, Math.round(canvas.clientHeight * dots));
+  const context = canvas.getContext("2d");
+  const ink = getComputedStyle(canvas).color;
+  const [floor, ceiling] = [canvas.height - 24 * dots, 6 * dots];
+  const across = (share) => share * canvas.width;
+  const at = (log) => across((log - span[0]) / (span[1] - span[0]));
+  const up = (share) => floor + share * (ceiling - floor);
+  const tallest = Math.max(...shares);
+  context.fillStyle = colour;
+  context.globalAlpha = 0.5;
+  shares.forEach((share, i) => {
+    const [left, top] = [across(i / shares.length), up(Math.sqrt(share / tallest))];
+    context.fillRect(left, top, canvas.width / shares.length + 0.5, floor - top);
+  });
+  context.globalAlpha = 1;
+  if (home.length) {
+    context.fillRect(0, floor + 2 * dots, at(home.at(-1)), 4 * dots);
+    context.fillStyle = ink;
+    for (const log of home) context.fillRect(at(log) - dots, floor, 2 * dots, 8 * dots);
+  }
+  context.beginPath();
+  weights.forEach((weight, i) => context.lineTo(across(i / (weights.length - 1)), up(weight)));
+  context.lineWidth = 2 * dots;
+  context.strokeStyle = ink;
+  context.stroke();
+  context.fillStyle = ink;
+  context.font = `${10 * dots}px sans-serif`;
+  context.textAlign = "center";
+  for (let power = Math.ceil(span[0]); power <= span[1]; power += 1) {
+    context.fillRect(at(power), floor, dots, 4 * dots);
+    context.fillText(String(10 ** power), Math.max(at(power), 12 * dots), canvas.height - 3 * dots);
+  }
+}
+
 function trace(context, points, scale) {
   context.beginPath();
   for (const [u, v] of points) context.lineTo(u * scale, v * scale);
@@ -57,6 +138,7 @@ function drawPanel(canvas, picture, shape, overlay) {
   const context = canvas.getContext("2d");
   context.imageSmoothingEnabled = false;
   context.drawImage(cellsAsImage(picture, shape), 0, 0, canvas.width, canvas.height);
+  hatch(context, overlay.hatched || [], scale, dots);
   context.lineCap = context.lineJoin = "round";
   for (const casing of [true, false]) {
     for (const { colour, points } of overlay.lines || []) {
@@ -77,17 +159,21 @@ function drawPanel(canvas, picture, shape, overlay) {
   const { start, goal } = overlay.marks || {};
   if (start) mark(context, start, scale, 6 * dots, 24, 1);
   if (goal) mark(context, goal, scale, 10 * dots, 10, 0.4);
+  const { brush } = overlay.marks || {};
+  if (brush) mark(context, brush, scale, 7 * dots, 8, 1);
 }
 
 function render({ model, el }) {
   el.classList.add("fgtutor-scene");
   const grid = make("div", "fgtutor-rows", el);
+  const charts = make("div", "fgtutor-row", el);
   const legend = make("div", "fgtutor-legend", el);
   const status = make("div", "fgtutor-status", el);
   status.setAttribute("role", "status"); // read aloud when it changes
   const reading = make("pre", "fgtutor-reading", el);
   let canvases = new Map();
   let laidOut = "";
+  let labelled = "";
   let scheduled = 0;
   let busy = false; // Python is still answering: what happens meanwhile is merged into `waiting`
   const waiting = [];
@@ -109,7 +195,10 @@ function render({ model, el }) {
         // Coloured text may be too pale to read: a bar beside it carries the policy's colour.
         if (colour) heading.style.borderLeft = `0.6em solid ${colour}`;
         if (colour) heading.style.paddingLeft = "0.4em";
-        const canvas = make("canvas", "fgtutor-canvas", figure);
+        const body = make("div", "fgtutor-body", figure);
+        make("div", "fgtutor-y", body);
+        const canvas = make("canvas", "fgtutor-canvas", body);
+        make("div", "fgtutor-x", body);
         canvas.tabIndex = 0;
         canvas.dataset.key = key;
         canvas.setAttribute("role", "application");
@@ -123,6 +212,38 @@ function render({ model, el }) {
     if (focused) canvases.get(focused[0])?.focus();
   }
 
+  function layOutCharts(list) {
+    while (charts.childElementCount > list.length) charts.lastChild.remove();
+    while (charts.childElementCount < list.length) {
+      const figure = make("figure", "fgtutor-panel", charts);
+      make("figcaption", "fgtutor-title", figure);
+      make("canvas", "fgtutor-chart", figure).setAttribute("role", "img");
+      make("div", "fgtutor-caption", figure);
+    }
+    list.forEach((chart, i) => {
+      const [heading, canvas, caption] = charts.children[i].children;
+      heading.textContent = chart.title;
+      const own = "; below: half, 90 % and 99 % of its own ground";
+      caption.textContent = `bars: this map, root of the share; line: w_ood${chart.home.length ? own : ""}`;
+      canvas.setAttribute("aria-label", chart.title);
+      if (canvas.clientWidth) drawChart(canvas, chart);
+    });
+  }
+
+  function labelAxes([x0, y0, x1, y1]) {
+    const asked = [laidOut, grid.clientWidth, x0, y0, x1, y1].join();
+    if (asked === labelled) return; // a drag changes no axis
+    labelled = asked;
+    for (const axis of grid.querySelectorAll(".fgtutor-x")) {
+      label(axis, x0, x1, axis.clientWidth > 300 ? 8 : 4, "left");
+      make("span", "fgtutor-unit", axis).textContent = "x (m)";
+    }
+    for (const axis of grid.querySelectorAll(".fgtutor-y")) {
+      label(axis, y0, y1, axis.clientHeight > 200 ? 6 : 3, "bottom");
+      make("span", "fgtutor-unit", axis).textContent = "y (m)";
+    }
+  }
+
   function draw() {
     scheduled = 0;
     layOut();
@@ -130,6 +251,8 @@ function render({ model, el }) {
     for (const [key, canvas] of canvases) {
       if (pictures[key] && canvas.clientWidth) drawPanel(canvas, pictures[key], shape, overlay);
     }
+    labelAxes(overlay.extent);
+    layOutCharts(overlay.charts);
     legend.replaceChildren();
     for (const [name, colour] of Object.entries(overlay.legend || {})) {
       make("span", "fgtutor-swatch", legend).style.background = colour;
@@ -157,7 +280,7 @@ function render({ model, el }) {
       waiting.push(message);
     } else if (message.cells) {
       last.cells.push(...message.cells);
-    } else {
+    } else if (message.step) {
       last.step = last.step.map((d, axis) => d + message.step[axis]);
     }
   }
@@ -201,10 +324,11 @@ function render({ model, el }) {
     });
     canvas.addEventListener("keydown", (event) => {
       const step = ARROWS[event.key];
-      if (!step) return;
+      const enter = event.key === " " || (event.key === "Enter" && !event.shiftKey);
+      if (!step && !enter) return;
       event.preventDefault(); // the page must not scroll,
       event.stopPropagation(); // and the notebook must not move to another of its cells
-      send({ kind: "move", step: [...step], shift: event.shiftKey });
+      send(step ? { kind: "move", step: [...step], shift: event.shiftKey } : { kind: "enter" });
     });
   }
 

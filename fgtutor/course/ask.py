@@ -1,0 +1,138 @@
+"""Questions to the learner: predict, then see the result beside the prediction; unfold an answer.
+
+Reads what the learner chooses or types below a cell; gives it back beside the answer. Nothing here
+waits for anybody: a notebook that runs without a reader prints the question and, later, the answer.
+"""
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fgtutor.errors import ConfigError, MissingExtraError
+
+OPEN = "nothing"
+"""What stands for a prediction that was not made."""
+
+
+@dataclass
+class Prediction:
+    """A question that was put, and what the learner said."""
+
+    prompt: str
+    """The question."""
+    choices: tuple[str, ...] = ()
+    """What can be chosen; empty for an answer in the learner's own words."""
+    said: str = ""
+    """The learner's prediction; empty until there is one."""
+
+
+_asked: list[Prediction] = []
+"""The questions put so far; `reveal` answers the last one."""
+
+
+def predict(prompt: str, choices: Sequence[str] | None = None) -> None:
+    """Ask for a prediction; what the learner says is kept until `reveal`.
+
+    Prints the question and goes on at once. In a live notebook a list of the choices, or a line to
+    write on, stands below it. Raises `ConfigError` for an empty question or fewer than two choices.
+    """
+    options = tuple(choices or ())
+    if not prompt.strip():
+        raise ConfigError("a prediction needs a question: say what the learner should predict")
+    if choices is not None and (len(options) < 2 or isinstance(choices, str)):
+        raise ConfigError(f"give at least two choices, or leave them out, got {choices!r}")
+    question = Prediction(prompt, options)
+    _asked.append(question)
+    print(f"Predict first: {prompt}")
+    for letter, choice in zip("abcdefghijklmnopqrstuvwxyz", options, strict=False):
+        print(f"  {letter}) {choice}")
+    _show_field(question)
+
+
+def _show_field(question: Prediction) -> None:
+    """Show what takes the prediction, where there is a notebook that can."""
+    try:
+        from IPython import get_ipython  # pyright: ignore[reportPrivateImportUsage]
+        from IPython.display import display
+
+        from fgtutor.course.widgets.still import w
+    except (ImportError, MissingExtraError):
+        return
+    if get_ipython() is None:
+        return
+    field: Any
+    if question.choices:
+        field = w.RadioButtons(options=question.choices, value=None, layout={"width": "auto"})
+    else:
+        field = w.Text(placeholder="your prediction", layout={"width": "32em"})
+
+    def take(change: Any) -> None:
+        question.said = change["new"] or ""
+
+    field.observe(take, "value")
+    display(field)
+
+
+class Answer:
+    """A prediction beside the answer, as a table or as text."""
+
+    def __init__(self, question: Prediction, answer: str) -> None:
+        self.question, self.answer = question, answer
+
+    @property
+    def verdict(self) -> str:
+        """Whether the prediction is the answer, where both come from a list of choices."""
+        known = self.answer in self.question.choices and self.question.said
+        if not known:
+            return ""
+        return "as you predicted" if self.question.said == self.answer else "not as you predicted"
+
+    def __repr__(self) -> str:
+        lines = [f"You predicted: {self.question.said}"] if self.question.said else []
+        verdict = f" ({self.verdict})" if self.verdict else ""
+        return "\n".join([*lines, f"The answer:    {self.answer}{verdict}"])
+
+    def _repr_html_(self) -> str:
+        said, answer = (html.escape(text) for text in (self.question.said or OPEN, self.answer))
+        verdict = f" ({self.verdict})" if self.verdict else ""
+        rows = (("question", html.escape(self.question.prompt)), ("you predicted", said),
+                ("the answer", f"<b>{answer}</b>{verdict}"))  # fmt: skip
+        cells = "".join(
+            f'<tr><th style="text-align: left">{name}</th>'
+            f'<td style="text-align: left">{text}</td></tr>'
+            for name, text in rows
+        )
+        return f"<table>{cells}</table>"
+
+
+def reveal(answer: str) -> Answer:
+    """Return the answer to the last `predict`, beside what the learner said; show it as a result.
+
+    Raises `ConfigError` if nothing was asked.
+    """
+    if not _asked:
+        raise ConfigError("nothing was predicted yet: run the cell with predict(...) first")
+    return Answer(_asked[-1], str(answer))
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question with an answer to unfold."""
+
+    text: str
+    """The question."""
+    answer: str
+    """The answer, which a page shows when it is asked for."""
+
+    def __repr__(self) -> str:
+        return f"{self.text}\n(Run this cell to unfold the answer.)"
+
+    def _repr_html_(self) -> str:
+        text, answer = html.escape(self.text), html.escape(self.answer)
+        return f"<details><summary>{text}</summary><p>{answer}</p></details>"
+
+
+def question(text: str, answer: str) -> Question:
+    """Return a self-test question whose answer is folded; show it as a cell's result."""
+    return Question(text, answer)
