@@ -248,12 +248,22 @@ def classical(cells: Cells, ground: AssessedMap) -> Sequence[Layers]:
     return [{GENERAL: _all_headings(values, ground)}]
 
 
-def classical_switched(cells: Cells, ground: AssessedMap) -> Sequence[Layers]:
-    """Plan on a classical map; our policy map P says which specialist drives."""
-    layer = _all_headings(torch.from_numpy(cells(ground.elevation, ground.radius)), ground)
-    tensors = ground.tensors()
-    _, policy_map = fuse(list(tensors.values()))
-    return [{name: layer * (policy_map == i) for i, name in enumerate(tensors)}]
+@dataclass(frozen=True)
+class Switched:
+    """Plan on a classical map; our policy map P says which specialist drives.
+
+    The map knows of no policies, so a change of them costs its search nothing, and each step has
+    one driver only (see `find_route`).
+    """
+
+    cells: Cells
+
+    def __call__(self, ground: AssessedMap) -> Sequence[Layers]:
+        """Return the layers: each step stands in that of its driver."""
+        values = torch.from_numpy(self.cells(ground.elevation, ground.radius))
+        layer, tensors = _all_headings(values, ground), ground.tensors()
+        _, policy_map = fuse(list(tensors.values()))
+        return [{name: layer * (policy_map == i) for i, name in enumerate(tensors)}]
 
 
 def _all_headings(values: Float[Tensor, "nx ny"], ground: AssessedMap) -> Float[Tensor, "nx ny d"]:
@@ -275,9 +285,9 @@ def planners(zoo: Mapping[str, Specialist]) -> dict[str, Planner]:
         "no-heading": without_heading,
         "no-fusion": without_fusion,
         **({"traversability": partial(classical, traversability)} if generalist else {}),
-        "traversability+P": partial(classical_switched, traversability),
+        "traversability+P": Switched(traversability),
         **({"occupancy": partial(classical, occupancy)} if generalist else {}),
-        "occupancy+P": partial(classical_switched, occupancy),
+        "occupancy+P": Switched(occupancy),
     }
 
 
@@ -292,8 +302,11 @@ def find_route(
     """Return the planner's cheapest route, whose `names` are the policies that may drive it.
 
     `settings` and `changes` are those of `planning.plan`, but for the thresholds and headings,
-    which are the map's. Raises `ConfigError` if the planner offers no layers.
+    which are the map's; where P names the drivers (`Switched`), changes of policy are free. Raises
+    `ConfigError` if the planner offers no layers.
     """
+    if isinstance(planner, Switched):
+        changes["switch_cost"] = 0.0
     answers = []
     for layers in planner(ground):
         team = {name: ground.zoo[name] for name in layers}

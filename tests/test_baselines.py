@@ -8,9 +8,9 @@ import torch
 from fgtutor.baselines import (
     AssessedMap,
     OccupancyConfig,
+    Switched,
     TraversabilityConfig,
     classical,
-    classical_switched,
     find_route,
     occupancy,
     ours,
@@ -204,12 +204,15 @@ def test_each_planner_drives_with_its_policies(known):
     assert drivers(flat) == (["general"] * 7, pytest.approx(7.0))
     # On a flat classical map a diagonal step costs as much as a straight one: any way will do, and
     # P says who drives it.
-    switched = find_route(
-        partial(classical_switched, traversability), known, (0.15, 0.45), (0.85, 0.45), PAPER
-    )
+    switched = find_route(Switched(traversability), known, (0.15, 0.45), (0.85, 0.45), PAPER)
     wanted = ["gaps" if heading else "steps" for heading in switched.headings]
     assert [switched.names[i] for i in switched.policies] == wanted
     assert switched.cost == pytest.approx(7.0)
+    # By our own settings, too, where a change costs something: the classical map knows of none.
+    ends = (0.15, 0.25), (0.85, 0.55)
+    dear, alone = (find_route(p, known, *ends) for p in (Switched(traversability), flat))
+    assert {dear.names[i] for i in dear.policies} == {"steps", "gaps"}
+    assert dear.length == pytest.approx(alone.length)
 
 
 def test_a_classical_map_refuses_what_a_specialist_crosses(known):

@@ -133,11 +133,14 @@ def test_an_answer_that_depends_on_the_notebook_s_state_is_not_kept():
         "import numpy as np\ncount = 0\ndef ood_weight(x, a, b):\n    global count\n"
         "    count += 1\n    return np.clip(1 - (x - a) / (b - a), 0, 1) + (count > 20)\n"
     )
-    answer = cell(source)
-    assert check("ex04.q2", answer.ood_weight).outcome == PASSED
-    assert "count = 11" in mine.read().get("ex04.q2", "count = 11")
-    # Counted on from the value it had: a second run of the cases no longer passes.
-    assert "does not pass" in check("ex04.q2", cell(source.replace("20", "11")).ood_weight).detail
+    answer = cell(source).ood_weight
+    verdict = check("ex04.q2", answer)
+    tried = answer.__globals__["count"]
+    assert verdict.outcome == PASSED and tried <= 20 < 2 * tried
+    # Taken out, it has the count it had by then, so a second run of the cases no longer passes.
+    assert "does not pass" in verdict.detail and mine.read() == {}
+    assert "Kept" in check("ex04.q2", cell(source.replace("20", "99")).ood_weight).detail
+    assert f"count = {tried}" in mine.read()["ex04.q2"]
 
 
 def test_names_that_clash_between_questions_are_refused():

@@ -13,6 +13,7 @@ from fgtutor.learning.calibrate import (
     CalibrateConfig,
     calibrated,
     met_in_training,
+    own_terrain,
     quantiles_on,
 )
 from fgtutor.learning.training import TrainConfig, train
@@ -110,6 +111,17 @@ def test_calibrating_changes_neither_policy_nor_f(make_rolling, config, tmp_path
     assert known.provenance["calibration"]["patches"] > 10
     loaded = load_specialist(save_specialist(known, tmp_path / "steps"))
     assert loaded.strangeness == known.strangeness
+
+
+def test_a_specialist_is_calibrated_on_ground_as_it_was_trained_on(make_specialist):
+    straight = own_terrain(make_specialist(), 4, 1)
+    assert all(one.elevation.shape[0] > one.elevation.shape[1] for one in straight)
+    config = {"neighbours": 0.0, "turned": 0.5}
+    square = own_terrain(make_specialist(provenance={"config": config}), 40, 1)
+    assert {one.elevation.shape[0] - one.elevation.shape[1] for one in square} == {0}
+    askew = [one for one in square if abs(one.goal[1] - one.start[1]) > 1e-6]
+    assert 10 <= len(askew) <= 30
+    assert {one.name for one in square} == {"steps"}
 
 
 def test_a_new_autoencoder_knows_its_terrain_better(make_rolling, config):

@@ -5,39 +5,70 @@ Reads the stages with her functions; draws what each says of the same drive or t
 # MuJoCo's functions come from a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false
 
+import copy
+from functools import cache
 from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 from matplotlib.figure import Figure
+from torch import Tensor, nn
 
-from fgtutor.course.drives import drive_together, straight_route
+from fgtutor.course.checks import find, nets
+from fgtutor.course.crossing import WINDOW, driven, labelled, rewarded
+from fgtutor.course.drives import collect, drive_together, straight_route
 from fgtutor.course.route_pictures import draw_drive
 from fgtutor.course.stages import (
     F_MIN,
     Stages,
-    assessed,
     corridor,
-    driven,
-    labelled,
-    planned,
-    rewarded,
+    library_route,
     same_shape,
+    tensors,
     zoo,
 )
+from fgtutor.feasibility import feasibility_labels
 from fgtutor.figures.charts import calibration_plot, draw_curves, draw_table
 from fgtutor.figures.style import TITLE, Picture
+from fgtutor.robots import env_class
 from fgtutor.robots.a1.model import A1Config, build_spec
+from fgtutor.robots.crossings import EnvConfig
 from fgtutor.statistics import calibration, spl, wilson_interval
-from fgtutor.world.terrain import make_terrain
+from fgtutor.world.terrain import World, make_terrain
 
 END = 10
 """Last steps of a drive that are not drawn: their advantage is that of an end, not of a step."""
+ROBOTS, SECONDS = 24, 12.0
+"""Robots of a rollout, and how long each drives, s."""
+HIDDEN, LATENT = 64, 8
+"""Sizes of the net that is trained on a rollout."""
+UPDATES = 150
+"""Updates by the joint loss, before the head alone is trained on."""
+GOAL, MOST = 0.05, 100
+"""Calibration error that its training aims at, and updates that it may take."""
+
+
+@cache
+def rollout(seed: int) -> dict[str, Tensor]:
+    """Return what robots that only roll met on steps of all heights, [time, robots, numbers]."""
+    tiles = [
+        make_terrain("steps", difficulty=(i % 5 + 1) / 5, seed=2 * i + seed) for i in range(20)
+    ]
+    config = EnvConfig(speed=(0.3, 1.5))
+    env = env_class("toy")(World([tiles]), ROBOTS, seed=seed, config=config)
+    return collect(env, lambda seen: torch.zeros(len(seen), 4), SECONDS)
+
+
+@cache
+def drive_of_the_library() -> tuple[Any, dict[str, np.ndarray]]:
+    """Return the episode in which the library drives its own route, and what was measured."""
+    return driven(Stages({}, []), library_route())
 
 
 def draw_labels(own: Stages) -> Figure:
     """Draw r_v of a drive, and the labels made of it."""
-    episode, measured = driven(Stages({}, []), planned(Stages({}, [])))
+    episode, measured = drive_of_the_library()
     r_v = rewarded(own, measured)
     labels = labelled(own, r_v, episode.reason == "fell")
     return draw_curves(
@@ -50,16 +81,94 @@ def draw_labels(own: Stages) -> Figure:
 
 
 def draw_calibration(own: Stages) -> Figure:
-    """Draw what the nets predicted on a drive against what was measured."""
-    episode, measured = driven(Stages({}, []), planned(Stages({}, [])))
-    labels = labelled(own, rewarded(own, measured), episode.reason == "fell")
-    ours = calibration(measured["f"], labels, 10)
+    """Train a Feasibility-Net on a rollout; draw what it says of another one against what came."""
+    patch, command, label = samples(own, rollout(0))
+    held_patch, held_command, held_label = samples(own, rollout(1))
+
+    def built(make: Any) -> nn.Module:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            net = make(patch.shape[1], command.shape[1], HIDDEN, LATENT)
+        with torch.no_grad():
+            same_shape(net.feasibility(patch, command), label)
+            same_shape(net.reconstruction(patch), label)
+        return net
+
+    net = own.run("FeasibilityNet", lambda: built(nets.build_net), built)
+    net, losses = own.run(
+        "joint_loss",
+        lambda: fitted(nets.joint_loss, net, patch, command, label),
+        lambda f: fitted(f, net, patch, command, label),
+    )
+
+    def trained(function: Any) -> tuple[nn.Module, int]:
+        head = Head(copy.deepcopy(net))
+        both = [torch.cat(pair, dim=-1) for pair in ((patch, command), (held_patch, held_command))]
+        updates, _ = function(head, both[0], label, both[1], held_label, GOAL, MOST)
+        return head.net, int(updates)
+
+    net, updates = own.run("train", lambda: trained(nets.train), trained)
+    with torch.no_grad():
+        f = net.feasibility(held_patch, held_command).double().numpy()
+    measured = held_label.double().numpy()
+    ours = calibration(f, measured, 10)
 
     def hers(function: Any) -> tuple[np.ndarray, float]:
-        table, error = function(measured["f"].copy(), labels.copy(), 10)
+        table, error = function(f.copy(), measured.copy(), 10)
         return same_shape(table, ours[0]), float(error)
 
-    return calibration_plot(*own.run("reliability", lambda: ours, hers))
+    figure = calibration_plot(*own.run("reliability", lambda: ours, hers))
+    figure.axes[0].set_title(
+        f"{figure.axes[0].get_title(loc='left')}\nJoint loss {losses[0]:.2f}, after {len(losses)} "
+        f"updates {losses[-1]:.2f}; then {updates} of the head",
+        **TITLE,
+        loc="left",
+    )
+    return figure
+
+
+class Head(nn.Module):
+    """A Feasibility-Net as `train` expects it: one input, patch and command in a row."""
+
+    def __init__(self, net: Any) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, both: Tensor) -> Tensor:
+        """Return f [n] of patches and commands [n, points + 3]."""
+        return self.net.feasibility(both[:, :-3], both[:, -3:])
+
+
+def samples(own: Stages, seen: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return patches, commands and labels of a rollout, every fifth that can be trusted."""
+    tracking = seen["tracking"]
+    r_v, failed, ended = tracking[1:].double().numpy().transpose(2, 0, 1)
+    ours = tuple(part[:-1].numpy() for part in feasibility_labels(tracking, WINDOW))
+    label, trusted = own.run(
+        "rollout_labels",
+        lambda: ours,
+        lambda f: [same_shape(part, r_v) for part in f(r_v.copy(), failed > 0, ended > 0, WINDOW)],
+    )
+    chosen = torch.tensor(np.flatnonzero(trusted.ravel())[::5])
+    patch, command = (seen[name][:-1].flatten(0, 1)[chosen] for name in ("patch", "command"))
+    return patch, command, torch.tensor(label.ravel()).float()[chosen]
+
+
+def fitted(
+    loss_of: Any, net: nn.Module, patch: Tensor, command: Tensor, label: Tensor
+) -> tuple[nn.Module, list[float]]:
+    """Return a copy of the net after its updates by a joint loss, and the loss at each (Eq. 2)."""
+    net, losses = copy.deepcopy(net), []
+    optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
+    noise = torch.Generator().manual_seed(0)
+    for _ in range(UPDATES):
+        drawn = torch.randn(len(patch), LATENT, generator=noise)
+        loss = loss_of(net, patch, command, label, drawn, 1.0, 5e-4)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss))
+    return net, losses
 
 
 def draw_stance(own: Stages) -> Figure:
@@ -101,34 +210,48 @@ def draw_stance(own: Stages) -> Figure:
 
 
 def draw_advantages(own: Stages) -> Figure:
-    """Draw the advantages of a drive over a critic that always says the mean."""
-    episode, measured = driven(Stages({}, []), planned(Stages({}, [])))
+    """Draw the advantages of a drive, and of a rollout, if a critic always says the mean."""
+    episode, measured = drive_of_the_library()
     rewards, gamma, lam = rewarded(Stages({}, []), measured), 0.97, 0.95
     done = np.zeros(len(rewards), dtype=bool)
     done[-1] = True
-    values = np.full(len(rewards) + 1, rewards.mean() / (1 - gamma))
-    ours, later = np.zeros(len(rewards)), 0.0
-    for t in reversed(range(len(rewards))):
-        surprise = rewards[t] + gamma * (not done[t]) * values[t + 1] - values[t]
-        ours[t] = later = surprise + gamma * lam * (not done[t]) * later
+    given = rewards, np.full(len(rewards) + 1, rewards.mean() / (1 - gamma)), done, gamma, lam
     found = own.run(
         "advantages",
-        lambda: ours,
-        lambda f: same_shape(f(rewards.copy(), values.copy(), done.copy(), gamma, lam), ours),
+        lambda: find("ex09.q2").truth(*given),
+        lambda f: same_shape(f(*copy.deepcopy(given)), rewards),
     )
-    return draw_curves(
-        episode.poses[:-END, 0],
-        {"advantage": found[:-END], "r_v of the step": rewards[:-END]},
-        title="Where did the toy do better (above 0) than it usually does?",
-        xlabel="x (m)",
-        ylabel="advantage, r_v",
+    r_v, failed, ended = rollout(0)["tracking"][1:].double().numpy().transpose(2, 0, 1)
+    fell, values = failed > 0, np.full(r_v.shape, r_v.mean() / (1 - gamma))
+    table = r_v, values, values.copy(), fell, (ended > 0) & ~fell, gamma, lam
+    batch = own.run(
+        "batch_advantages",
+        lambda: find("ex09.q4").truth(*table),
+        lambda f: same_shape(f(*copy.deepcopy(table)), r_v),
     )
+    figure = Picture(7.4, 5.0)
+    upper, lower = figure.subplots(2, 1)
+    x = episode.poses[:-END, 0]
+    upper.plot(x, found[:-END], label="advantage")
+    upper.plot(x, rewards[:-END], "--", label="r_v of the step")
+    upper.axhline(0, color="grey", linewidth=0.8)
+    upper.set(xlabel="x (m)")
+    upper.legend(loc="lower left", fontsize=9)
+    upper.set_title("Where did the toy do better (above 0) than usual?", **TITLE, loc="left")
+    image = lower.imshow(
+        batch.T, extent=(0, SECONDS, ROBOTS, 0), aspect="auto", cmap="BrBG", vmin=-3, vmax=3
+    )
+    when, who = np.nonzero(fell)
+    lower.plot(SECONDS * (when + 1) / len(r_v), who + 0.5, "kx", markersize=5)
+    lower.set(xlabel="time (s)", ylabel="robot")
+    figure.colorbar(image, ax=lower, label="advantage")
+    lower.set_title("A rollout, normalised; a cross is a failure", **TITLE, loc="left")
+    return figure
 
 
 def draw_length(own: Stages) -> Figure:
     """Draw a drive, and say how long it was and what its SPL is."""
-    route = planned(Stages({}, []))
-    episode, _ = driven(Stages({}, []), route)
+    route, (episode, _) = library_route(), drive_of_the_library()
     xy = episode.poses[:, :2]
     length = own.run("path_length", lambda: episode.length, lambda f: float(f(xy.copy())))
     trial = np.array([episode.success]), np.array([length]), np.array([route.length])
@@ -195,10 +318,9 @@ def draw_scan(own: Stages) -> Figure:
         lambda: highest,
         lambda f: same_shape(f(points.copy(), truth.shape, resolution, 2), truth),
     )
-    route = planned(Stages({}, []))
-    closed = np.stack([said.weighted(0.1, 2.0).numpy() for said in assessed().values()])
+    route = library_route()
     at = (slice(None), *route.cells[:-1].T, route.headings)
-    choices = np.maximum(closed[at].T.astype(float), F_MIN)
+    choices = np.maximum(tensors(Stages({}, []))[at].T, F_MIN)
     switch = 2.0
     cost = 1 / choices[0]
     for step in choices[1:]:

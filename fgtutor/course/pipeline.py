@@ -27,26 +27,30 @@ from fgtutor.course.planner_pictures import (
 )
 from fgtutor.course.stages import Stages
 
+TENSORS = ("tensorize", "cut_patch", "reconstruction_loss", "ood_weight", "conformal_weight")
+"""From the map to F_i, in the order in which they run."""
+ROUTE = (*TENSORS, "fuse", "edge_costs", "cheapest_route")
+"""From the map to the route."""
 PICTURES: dict[str, tuple[Callable[[Stages], Figure], tuple[str, ...]]] = {
     "ex01": (draw_patch, ("cells_of", "patch_points", "cut_patch", "rise")),
     "ex02": (draw_labels, ("tracking_reward", "labels")),
-    "ex03": (draw_calibration, ("reliability", "tracking_reward", "labels")),
-    "ex04": (draw_weights, ("reconstruction_loss", "ood_weight", "conformal_weight")),
-    "ex05": (draw_tensor, ("first_layer", "turned")),
-    "ex06": (draw_plan, ("fuse", "edge_costs", "cheapest_route", "route_cost", "ood_weight")),
-    "ex07": (
-        draw_crossing,
-        ("aim_point", "turn_rate", "active_policies", "fuse", "cheapest_route", "ood_weight"),
+    "ex03": (
+        draw_calibration,
+        ("FeasibilityNet", "joint_loss", "rollout_labels", "train", "reliability"),
     ),
+    "ex04": (draw_weights, ("reconstruction_loss", "ood_weight", "conformal_weight", *TENSORS)),
+    "ex05": (draw_tensor, ("tensorize", "first_layer", "turned", "reassess", "cut_patch")),
+    "ex06": (
+        draw_plan,
+        ("fuse", "edge_costs", "cheapest", "route_cost", "cheapest_switching", *ROUTE),
+    ),
+    "ex07": (draw_crossing, ("aim_point", "turn_rate", "active_policies", "drive", *ROUTE)),
     "ex08": (draw_stance, ("joint_torques", "gravity_in_body")),
-    "ex09": (draw_advantages, ("advantages",)),
+    "ex09": (draw_advantages, ("advantages", "batch_advantages")),
     "ex10": (draw_length, ("path_length", "spl")),
     "ex11": (draw_success, ("success_table", "wilson_interval")),
     "ex12": (draw_scan, ("rasterise", "localisation_std", "cheapest_with_switches")),
-    "ex13": (
-        draw_crossing,
-        ("fuse", "cheapest_route", "ood_weight", "aim_point", "turn_rate", "active_policies"),
-    ),
+    "ex13": (draw_crossing, (*ROUTE, "aim_point", "turn_rate", "active_policies", "drive")),
 }
 """For each exercise its picture, and the functions that show in it."""
 

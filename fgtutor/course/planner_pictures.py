@@ -14,16 +14,22 @@ from matplotlib.figure import Figure
 from scipy.ndimage import median_filter
 
 from fgtutor import patches
+from fgtutor.course.crossing import driven, glided
 from fgtutor.course.patch_pictures import heading_maps, patch_at
 from fgtutor.course.route_pictures import draw_drive
 from fgtutor.course.stages import (
+    F_MIN,
     Stages,
-    assessed,
+    asked,
     corridor,
-    driven,
+    edges,
+    ends,
     fused,
+    library_plan,
     planned,
+    routed,
     same_shape,
+    tensors,
     weights,
     zoo,
 )
@@ -31,10 +37,9 @@ from fgtutor.directions import NUM_HEADINGS
 from fgtutor.elevation import ElevationMap
 from fgtutor.figures.maps import draw_elevation, draw_route
 from fgtutor.figures.style import TITLE, Picture
-from fgtutor.tensorization import assess_all
 
-OWN = slice(95, 126)
-"""Where along x the corridor has steps, the own terrain of the steps specialist."""
+SWITCH = 2.0
+"""What a change of policy costs, in steps over perfect ground."""
 
 
 def draw_patch(own: Stages) -> Figure:
@@ -93,37 +98,18 @@ def draw_patch(own: Stages) -> Figure:
 
 
 def draw_weights(own: Stages) -> Figure:
-    """Draw L_recon and w_ood of every specialist along +x."""
-    elevation, every = corridor().elevation, weights(own)
-    net: Any = zoo()["steps"].feasibility
-    grid = zoo()["steps"].grid
-    x, y = (torch.tensor(centres, dtype=torch.float32) for centres in elevation.centres)
-    poses = torch.cartesian_prod(x, y, torch.zeros(1))
-    with torch.no_grad():
-        seen = net.relief(patch_at(elevation, poses, grid))
-        decoded = net.decoder(net.encoder(seen).chunk(2, dim=-1)[0]).double().numpy()
-    heights = seen.double().numpy() / net.height_scale
-    ours = assessed()["steps"].reconstruction[..., 0].numpy()
-    loss = own.run(
-        "reconstruction_loss",
-        lambda: ours,
-        lambda f: same_shape(f(heights, decoded, net.height_scale), ours.ravel()).reshape(
-            ours.shape
-        ),
-    )
-    flat, known = loss.ravel(), loss[OWN].ravel()
-    share = np.array([(known >= one).mean() for one in flat])
-    trust = own.run(
-        "conformal_weight",
-        lambda: np.minimum(share / 0.1, 1.0),
-        lambda f: same_shape(f(flat.copy(), known.copy(), 0.1), flat),
-    ).reshape(loss.shape)
+    """Draw L_recon of the steps specialist, and w_ood of all of them, along +x."""
+    losses = {name: loss for name, (_, loss) in asked(own).items()}
+    every = weights(own, losses)
     panels = {
-        "L_recon of steps, up to 5": np.minimum(loss, 5) / 5,
-        "the same as a p-value's weight (alpha = 0.1)": trust,
+        "L_recon of steps, up to 5": np.minimum(losses["steps"][..., 0], 5) / 5,
         **{f"w_ood of {name}": weight[..., 0] for name, weight in every.items()},
     }
-    return layers(panels, "Which ground does each specialist know? Heading 0 (+x)")
+    return layers(
+        panels,
+        "Which ground does each specialist know? Heading 0 (+x)\n(w_ood: the smaller one of "
+        "Eq. 4 and of the p-value's weight)",
+    )
 
 
 def layers(panels: Mapping[str, np.ndarray], title: str) -> Picture:
@@ -146,11 +132,29 @@ def layers(panels: Mapping[str, np.ndarray], title: str) -> Picture:
 
 
 def draw_tensor(own: Stages) -> Figure:
-    """Draw f of the steps specialist along the four axes, by one layer slid over turned maps."""
-    part = corridor().elevation.crop(4.5, 0.0, 9.5, 4.0)
-    steps = {"steps": zoo()["steps"]}
-    ours = assess_all(part, steps)["steps"].f.double().numpy()
-    answer = np.zeros_like(ours)
+    """Draw f of the steps specialist over the slopes, and say two shorter ways to it."""
+    x0, x1, around = 4.5, 9.5, 13  # cells: a patch reaches no further
+    shown, elevation = slice(around, -around), corridor().elevation
+    margin = around * elevation.resolution
+    first, last = (round(x / elevation.resolution) for x in (x0, x1))
+    answer = asked(own)["steps"][0][first:last]
+    part = elevation.crop(x0 - margin, 0.0, x1 + margin, 4.0)
+    along = convolved(own, part)[shown]
+    worst = float(np.abs(along - answer)[..., ::2].max())
+    again, windows = renewed(own, part)
+    figure = heading_maps(answer, elevation.crop(x0, 0.0, x1, 4.0), label="f of steps")
+    figure.suptitle(
+        f"f of steps over the slopes; by convolution, it differs by {worst:.0e} at most\n"
+        f"With a box put down here, {again:,} of {windows:,} windows along +x are asked again",
+        **TITLE,
+        x=0.01,
+    )
+    return figure
+
+
+def convolved(own: Stages, part: ElevationMap) -> Float[np.ndarray, "nx ny 8"]:
+    """Return f of the steps specialist along the four axes, by one layer slid over turned maps."""
+    answer = np.zeros((*part.shape, NUM_HEADINGS))
     for quarters in range(4):
         turned = part.rotated90(-quarters % 4)
         along = np.zeros((*turned.shape, NUM_HEADINGS))
@@ -161,16 +165,51 @@ def draw_tensor(own: Stages) -> Figure:
             lambda back=back: back,
             lambda f, along=along, q=quarters, back=back: same_shape(f(along, q), back),
         )
-    worst = float(np.abs(answer - ours)[..., ::2].max())
-    answer[..., 1::2] = ours[..., 1::2]
-    figure = heading_maps(answer, part, label="f of steps")
-    figure.suptitle(
-        f"f of steps over the slopes, by convolution: off by {worst:.0e} at most\n(along the "
-        "axes; the diagonals are the library's)",
-        **TITLE,
-        x=0.01,
-    )
-    return figure
+    return answer
+
+
+def renewed(own: Stages, part: ElevationMap) -> tuple[int, int]:
+    """Put a box of 3 x 3 cells on the map; return how many windows were asked again, and of all.
+
+    Raises `ValueError` inside the stage, so that it is named, if an answer differs from the net's.
+    """
+    specialist = zoo()["steps"]
+    grid, command = specialist.grid, torch.tensor(specialist.command)
+    rows, columns = grid.shape
+    before = patches.prepare(part).heights.astype(float)
+    after = before.copy()
+    after[part.shape[0] // 2 :, part.shape[1] // 2 :][:3, :3] += 0.15
+    count = 0
+
+    def ask(windows: np.ndarray) -> np.ndarray:
+        nonlocal count
+        count += len(windows)
+        cut = torch.tensor(windows).float()
+        with torch.no_grad():
+            relative = cut - patches.ground_height(cut, grid)
+            f = specialist.feasibility.feasibility(relative, command.expand(len(cut), -1))
+        return f.double().numpy()
+
+    def windows_of(heights: np.ndarray) -> np.ndarray:
+        view = np.lib.stride_tricks.sliding_window_view(heights, (rows, columns))
+        return view.reshape(*view.shape[:2], -1)
+
+    old, new = windows_of(before), windows_of(after)
+    known, wanted = (ask(w.reshape(-1, w.shape[-1])).reshape(w.shape[:2]) for w in (old, new))
+
+    def hers(function: Any) -> int:
+        nonlocal count
+        count = 0
+        answer = same_shape(
+            function(known.copy(), before.copy(), after.copy(), rows, columns, ask), known
+        )
+        if np.abs(answer - wanted).max() > 1e-5:
+            raise ValueError(
+                "its answers are not those of the network for the map after the change"
+            )
+        return count
+
+    return own.run("reassess", lambda: int((old != new).any(axis=-1).sum()), hers), known.size
 
 
 def ahead(own: Stages, elevation: ElevationMap) -> Float[np.ndarray, "nx ny"]:
@@ -203,10 +242,11 @@ def ahead(own: Stages, elevation: ElevationMap) -> Float[np.ndarray, "nx ny"]:
 
 
 def draw_plan(own: Stages) -> Figure:
-    """Draw F_max and the route over the corridor."""
-    best, _ = fused(own)
-    route = planned(own)
-    figure = Picture(7.4, 4.4)
+    """Draw F_max and the route over the corridor, and what it costs with and without switches."""
+    every = tensors(own)
+    best, policy = fused(own, every)
+    route = routed(own, best, policy)
+    figure = Picture(7.4, 4.8)
     upper, lower = figure.subplots(2, 1, sharex=True)
     elevation = corridor().elevation
     x0, y0, x1, y1 = elevation.extent
@@ -217,12 +257,25 @@ def draw_plan(own: Stages) -> Figure:
     upper.set_title("F_max along the best heading of each cell", **TITLE, loc="left")
     draw_elevation(elevation, axes=lower, bare=True)
     draw_route(route, elevation, axes=lower)
+    counted = float((1 / route.feasibility).sum())
     cost = own.run(
-        "route_cost",
-        lambda: route.cost / elevation.resolution,  # the exercise counts in cells
-        lambda f: float(f(best.copy(), route.cells.copy())),
+        "route_cost", lambda: counted, lambda f: float(f(best.copy(), route.cells.copy()))
     )
-    lower.set_title(f"The route: {route.length:.1f} m at a cost of {cost:.1f}", **TITLE, loc="left")
+    least = own.run(
+        "cheapest", lambda: counted, lambda f: float(f(edges(own, best).copy(), *ends()))
+    )
+    thinking = own.run(
+        "cheapest_switching",
+        lambda: float(library_plan(best, policy, tensors=[*every], switch_cost=SWITCH).costs.sum()),
+        lambda f: float(f(every.copy(), F_MIN, SWITCH, *ends())),
+    )
+    lower.set_title(
+        f"The route: {route.length:.1f} m, cost {cost:.1f}; no route costs less than {least:.1f}\n"
+        f"If a switch costs {SWITCH:g}, its {route.switches} switches make that "
+        f"{cost + SWITCH * route.switches:.1f}; a planner that knows finds {thinking:.1f}",
+        **TITLE,
+        loc="left",
+    )
     return figure
 
 
@@ -230,4 +283,9 @@ def draw_crossing(own: Stages) -> Figure:
     """Draw the robot's drive over the route, with every stage of the planner."""
     route = planned(own)
     episode, _ = driven(own, route)
-    return draw_drive(episode, route, corridor().elevation)
+    figure = draw_drive(episode, route, corridor().elevation)
+    ghost = glided(own, route, episode.seconds / len(episode.poses))
+    axes = figure.axes[0]
+    axes.plot(*ghost[:, :2].T, ":", color="black", linewidth=1.5)
+    axes.set_title(f"{axes.get_title(loc='left')}; dotted: without physics", **TITLE, loc="left")
+    return figure

@@ -1,12 +1,13 @@
 """The stages of the planner, each the learner's function if it has passed, else the library's.
 
 Reads functions by name; runs them on one terrain of the toy, a corridor with all four obstacles
-across it. A function that fails on the real data is named, and the library's runs in its place.
+across it, and gives each stage's answer to the next: patches, f and L_recon, w_ood, F_i, F_max and
+P, and a route, which `crossing` drives. A function that fails on this data is named, and the
+library's runs in its place.
 """
 
-import math
+import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -14,18 +15,18 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from fgtutor import patches
 from fgtutor.course.grading.replies import TooSlow, explain, time_limit
+from fgtutor.course.patch_pictures import patch_at
 from fgtutor.directions import STEPS, Headings
-from fgtutor.execution import Episode, FollowConfig
-from fgtutor.feasibility import tracking_reward
+from fgtutor.elevation import ElevationMap
+from fgtutor.feasibility import ALPHA, ood_weight
 from fgtutor.fusion import fuse
 from fgtutor.planning import plan
-from fgtutor.robots import env_class
-from fgtutor.robots.steering import slowdown, turn_rate
 from fgtutor.routes import Route
 from fgtutor.specialist import Specialist, load_zoo
-from fgtutor.tensorization import Assessment, assess_all
-from fgtutor.world.terrain import Terrain, World, make_terrain
+from fgtutor.tensorization import assess
+from fgtutor.world.terrain import Terrain, make_terrain
 
 SECONDS = 20.0
 """CPU time that one stage may take with a function of the learner's, s."""
@@ -35,10 +36,8 @@ TAUS = 0.1, 2.0
 """The paper's thresholds on L_recon."""
 F_MIN = 0.1
 """Least feasibility of an edge."""
-WINDOW = 50
-"""Control steps that a label is the mean of: one second."""
-DRIVEN = 1500
-"""Control steps after which a drive is given up: a minute."""
+AHEAD = [1, 7]
+"""The diagonal headings that lead towards the goal; the learner's patches are cut along them."""
 
 
 class Stages:
@@ -103,62 +102,210 @@ def zoo() -> dict[str, Specialist]:
 
 
 @cache
-def assessed() -> dict[str, Assessment]:
-    """Return f and L_recon of every cell and heading of the corridor."""
-    return assess_all(corridor().elevation, zoo())
+def library_patches() -> Float[np.ndarray, "nx ny 8 points"]:
+    """Return the patch of every cell and heading, m, as the library cuts it."""
+    x, y = (torch.tensor(centres) for centres in corridor().elevation.centres)
+    poses = torch.cartesian_prod(x, y, torch.tensor(Headings().yaws))
+    cut = patch_at(corridor().elevation, poses, _grid())
+    return cut.reshape(len(x), len(y), Headings().count, -1).numpy()
+
+
+@cache
+def own_losses() -> dict[str, Float[np.ndarray, " n"]]:
+    """Return for each specialist L_recon on its own terrain, at places of another map."""
+    found = {}
+    for name, specialist in zoo().items():
+        elevation = make_terrain(name, robot="toy", seed=SEED + 1).elevation
+        losses = assess(elevation, specialist).reconstruction[..., 0].double().numpy()
+        found[name] = losses[::4, ::4].ravel()
+    return found
+
+
+def _grid() -> patches.PatchGrid:
+    """Return where the points of a patch lie; the toy's specialists agree on it."""
+    return zoo()["steps"].grid
 
 
 # The stages ---------------------------------------------------------------------------------------
 
 
-def weights(own: Stages) -> dict[str, Float[np.ndarray, "nx ny 8"]]:
-    """Return w_ood of each specialist, by the paper's thresholds (Eq. 4)."""
-    found = {}
-    for name, said in assessed().items():
-        loss, ours = said.reconstruction.numpy(), said.ood(*TAUS).numpy()
-        found[name] = own.run(
-            "ood_weight",
+def seen(own: Stages) -> Float[np.ndarray, "nx ny 8 points"]:
+    """Return the patch H_xy of every cell and heading, m, relative to the ground below the robot.
+
+    `tensorize` slides the windows along the four axes. `cut_patch` cuts the patches along the two
+    diagonals ahead, one call for each; those of the way back stay the library's.
+    """
+    ours = library_patches()
+    surface = patches.prepare(corridor().elevation)
+    patch = ours.copy()
+    patch[:, :, ::2] = own.run(
+        "tensorize", lambda: ours[:, :, ::2], lambda f: windows_of(f, surface)
+    )
+    patch[:, :, AHEAD] = own.run(
+        "cut_patch", lambda: ours[:, :, AHEAD], lambda f: diagonals_of(f, surface)
+    )
+    return patch
+
+
+def windows_of(function: Callable[..., Any], surface: ElevationMap) -> np.ndarray:
+    """Return the patches [nx, ny, 4, points] that the learner's `tensorize` asks about.
+
+    The network that it asks only counts the windows, so the tensor says which window belongs to
+    which cell. Her robot stands in the first row of a window, ours `behind` further ahead.
+    """
+    grid, (nx, ny) = _grid(), surface.shape
+    rows, columns = grid.shape
+    around = max(rows, columns)  # beyond its edge the map goes on as it ends
+    heights = np.pad(surface.heights.astype(float), around, mode="edge")
+    asked: list[np.ndarray] = []
+
+    def ask(windows: np.ndarray) -> np.ndarray:
+        asked.extend(np.array(windows))
+        return np.arange(len(asked) - len(windows), len(asked)) + 1.0
+
+    answer = same_shape(function(heights, rows, columns, ask), np.zeros((*heights.shape, 4)))
+    back = around - round(grid.behind / grid.spacing) * STEPS[::2]
+    number = [answer[x : x + nx, y : y + ny, k] for k, (x, y) in enumerate(back.tolist())]
+    which = np.stack(number, axis=-1).astype(int) - 1
+    if which.min() < 0 or which.max() >= len(asked):
+        raise ValueError("its tensor lacks windows of the map, or changes what `ask` answers")
+    cut = np.array(asked)[which]
+    return cut - np.median(cut[..., grid.footprint_index.numpy()], axis=-1, keepdims=True)
+
+
+def diagonals_of(function: Callable[..., Any], surface: ElevationMap) -> np.ndarray:
+    """Return the patches [nx, ny, 2, points] that the learner's `cut_patch` cuts ahead."""
+    grid, (x, y), yaws = _grid(), surface.centres, Headings().yaws
+    offsets, under = grid.points.double().numpy(), np.zeros(grid.num_points, dtype=bool)
+    under[grid.footprint_index.numpy()] = True
+    # Points beyond the map are unknown to her: there the map goes on as it ends.
+    around = round(patches.reach(grid) / surface.resolution) + 1
+    heights = np.pad(surface.heights.astype(float), around, mode="edge")
+    origin = np.array(surface.origin) - around * surface.resolution
+    given = heights, origin, surface.resolution
+    poses = np.array([*itertools.product(x, y, yaws[AHEAD])])
+    cut = np.array([function(*given, pose, offsets, under) for pose in poses])
+    return cut.reshape(len(x), -1, 2, grid.num_points)
+
+
+def asked(own: Stages) -> dict[str, tuple[Float[np.ndarray, "nx ny 8"], ...]]:
+    """Return f and L_recon of every cell and heading, by each specialist's networks."""
+    patch, found = torch.tensor(seen(own)), {}
+    for name, specialist in zoo().items():
+        net: Any = specialist.feasibility
+        with torch.no_grad():
+            command = torch.tensor(specialist.command).expand(*patch.shape[:-1], -1)
+            f = net.feasibility(patch, command).double().numpy()
+            relief = net.relief(patch)
+            decoded = net.decoder(net.encoder(relief).chunk(2, dim=-1)[0])
+            ours = (decoded - relief).square().sum(dim=-1).double().numpy()
+        # In metres, as the autoencoder sees them: it may let great heights saturate.
+        heights = relief.flatten(0, -2).double().numpy() / net.height_scale
+        flat = decoded.flatten(0, -2).double().numpy()
+        loss = own.run(
+            "reconstruction_loss",
             lambda ours=ours: ours,
-            lambda f, loss=loss, ours=ours: same_shape(f(loss, *TAUS), ours),
+            lambda g, h=heights, d=flat, scale=net.height_scale, ours=ours: same_shape(
+                g(h, d, scale), ours.ravel()
+            ).reshape(ours.shape),
         )
+        found[name] = f, loss
     return found
 
 
-def fused(own: Stages) -> tuple[Float[np.ndarray, "nx ny 8"], Int[np.ndarray, "nx ny 8"]]:
-    """Return F_max and P of all specialists (Eqs. 5-7)."""
-    every, closed = weights(own), []
-    for name, said in assessed().items():
-        weighted = torch.as_tensor(every[name], dtype=torch.float32) * said.f
-        closed.append(said.closed(weighted).numpy())
-    ours = tuple(np.asarray(part) for part in fuse(closed))
+def weights(
+    own: Stages, losses: Mapping[str, Float[np.ndarray, "nx ny 8"]]
+) -> dict[str, Float[np.ndarray, "nx ny 8"]]:
+    """Return w_ood of each specialist: what it knows by the paper's thresholds AND by its p-value.
+
+    The smaller counts of Eq. 4 and of clip(p / alpha), p among the losses on its own terrain.
+    """
+    found = {}
+    for name, loss in losses.items():
+        known = np.sort(own_losses()[name])
+        flat = loss.ravel()
+        by_loss = own.run(
+            "ood_weight",
+            lambda loss=loss: ood_weight(loss, *TAUS),
+            lambda f, loss=loss: same_shape(f(loss.copy(), *TAUS), loss),
+        )
+        by_share = own.run(
+            "conformal_weight",
+            lambda flat=flat, known=known: p_weight(flat, known),
+            lambda f, flat=flat, known=known: same_shape(f(flat.copy(), known.copy(), ALPHA), flat),
+        )
+        found[name] = np.minimum(by_loss, by_share.reshape(loss.shape))
+    return found
+
+
+def p_weight(losses: Float[np.ndarray, " m"], known: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Return clip(p / alpha), p the share of the sorted `known` losses that are as large."""
+    beyond = len(known) - np.searchsorted(known, losses)
+    return np.clip(beyond / len(known) / ALPHA, 0, 1)
+
+
+def tensors(own: Stages) -> Float[np.ndarray, "policies nx ny 8"]:
+    """Return F_i = w_ood f of each specialist, 0 where a step leaves the map (Eq. 5)."""
+    said = asked(own)
+    trust = weights(own, {name: loss for name, (_, loss) in said.items()})
+    inside = Headings().steps_within(corridor().elevation.known)
+    return np.stack([np.where(inside, trust[name] * f, 0.0) for name, (f, _) in said.items()])
+
+
+def fused(
+    own: Stages, every: Float[np.ndarray, "policies nx ny 8"]
+) -> tuple[Float[np.ndarray, "nx ny 8"], Int[np.ndarray, "nx ny 8"]]:
+    """Return F_max and P of all specialists (Eqs. 6-7)."""
+    ours = tuple(np.asarray(part) for part in fuse([*every]))
 
     def hers(function: Any) -> tuple[np.ndarray, np.ndarray]:
-        best, policy = function(np.stack(closed))
+        best, policy = function(every.copy())
         return same_shape(best, ours[0]), same_shape(policy, ours[1]).astype(int)
 
     return own.run("fuse", lambda: ours, hers)
 
 
-def planned(own: Stages) -> Route:
-    """Return the cheapest route over the corridor (Sec. III-C)."""
-    best, policy = fused(own)
-    terrain = corridor()
-    grid = terrain.elevation
-
-    def ours() -> Route:
-        start, goal = terrain.start, terrain.goal
-        options = {"names": tuple(zoo()), "f_min": F_MIN}
-        return plan(best, policy, grid=grid, start=start, goal=goal, **options).raise_for()
-
+def edges(own: Stages, best: Float[np.ndarray, "nx ny 8"]) -> Float[np.ndarray, "nx ny 8"]:
+    """Return the cost of every step, 1 / F_max, infinite below F_MIN (Sec. III-C)."""
     with np.errstate(divide="ignore"):
         costs = np.where(best >= F_MIN, 1 / best, np.inf)
-    costs = own.run("edge_costs", lambda: costs, lambda f: same_shape(f(best, F_MIN), costs))
-    start, goal = grid.cell_of(*terrain.start), grid.cell_of(*terrain.goal)
+    return own.run("edge_costs", lambda: costs, lambda f: same_shape(f(best.copy(), F_MIN), costs))
+
+
+def planned(own: Stages) -> Route:
+    """Return the cheapest route over the corridor, by all stages that come before it."""
+    return routed(own, *fused(own, tensors(own)))
+
+
+@cache
+def library_route() -> Route:
+    """Return the route that the library plans over the corridor."""
+    return planned(Stages({}, []))
+
+
+def routed(
+    own: Stages, best: Float[np.ndarray, "nx ny 8"], policy: Int[np.ndarray, "nx ny 8"]
+) -> Route:
+    """Return the cheapest route by F_max and P (Sec. III-C)."""
+    costs = edges(own, best)
 
     def hers(function: Any) -> Route:
-        return route_of(np.asarray(function(costs.copy(), start, goal)), best, policy, costs)
+        return route_of(np.asarray(function(costs.copy(), *ends())), best, policy, costs)
 
-    return own.run("cheapest_route", ours, hers)
+    return own.run("cheapest_route", lambda: library_plan(best, policy), hers)
+
+
+def library_plan(best: np.ndarray, policy: np.ndarray, **options: Any) -> Route:
+    """Return the library's route by F_max and P; raises a `PlanningError` if there is none."""
+    terrain = corridor()
+    places = {"grid": terrain.elevation, "start": terrain.start, "goal": terrain.goal}
+    return plan(best, policy, names=tuple(zoo()), f_min=F_MIN, **places, **options).raise_for()
+
+
+def ends() -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the cells of the start and the goal."""
+    terrain = corridor()
+    return terrain.elevation.cell_of(*terrain.start), terrain.elevation.cell_of(*terrain.goal)
 
 
 def route_of(
@@ -168,10 +315,8 @@ def route_of(
     costs: Float[np.ndarray, "nx ny 8"],
 ) -> Route:
     """Describe a chain of cells; raises `ValueError` if it is none from start to goal."""
-    terrain = corridor()
-    grid, headings = terrain.elevation, Headings()
-    ends = [grid.cell_of(*terrain.start), grid.cell_of(*terrain.goal)]
-    if len(cells) < 2 or [*map(tuple, cells[[0, -1]].tolist())] != ends:
+    grid, headings = corridor().elevation, Headings()
+    if len(cells) < 2 or (*map(tuple, cells[[0, -1]].tolist()),) != ends():
         raise ValueError("its cells do not lead from the start to the goal")
     steps = np.diff(cells, axis=0)
     if not (steps[:, None] == STEPS).all(axis=-1).any(axis=-1).all():
@@ -188,121 +333,4 @@ def route_of(
         costs=costs[at],
         length=float(headings.lengths[along].sum() * grid.resolution),
         names=tuple(zoo()),
-    )
-
-
-def nearest_ahead(route: Route, place: np.ndarray, distance: float) -> np.ndarray:
-    """Return the vertex `distance` further along the route than the one nearest to a place."""
-    along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(route.xy, axis=0).T))))
-    here = along[np.hypot(*(route.xy - place).T).argmin()]
-    return route.xy[min(int(np.searchsorted(along, here + distance)), len(along) - 1)]
-
-
-def held(wanted: Int[np.ndarray, " steps"], hold: int) -> Int[np.ndarray, " steps"]:
-    """Return the active policies: one takes over when it was wanted for `hold` steps in a row."""
-    active, waiting, chosen = wanted[0], 0, []
-    for policy in wanted.tolist():
-        waiting = waiting + 1 if policy != active else 0
-        if waiting >= hold:
-            active, waiting = policy, 0
-        chosen.append(active)
-    return np.array(chosen)
-
-
-def driven(own: Stages, route: Route) -> tuple[Episode, dict[str, np.ndarray]]:
-    """Drive a route in simulation, and return what was measured at each step too.
-
-    That is the velocity (vx, vy) [n, 2] and the command [n, 2], m/s, and f of the active policy.
-    """
-    config, specialists = FollowConfig(), [*zoo().values()]
-    robot = env_class("toy")
-    episodes = replace(robot.episodes, train=False, stuck_seconds=math.inf)
-    env = robot(World([[corridor()]]), 1, config=episodes)
-    corner = env.offsets[0, 0].numpy().astype(float)
-    speed = min(specialist.command[0] for specialist in specialists)
-    env.start(torch.arange(1), torch.tensor([[*(route.xy[0] + corner), 0.0]]).float(), speed)
-    seen: dict[str, list] = {"pose": [], "policy": [], "velocity": [], "command": [], "f": []}
-    wanted: list[int] = []
-    limit = env.config.max_turn_rate
-    reason = "timeout"
-    for _ in range(DRIVEN):
-        pose = env.motion()[0][0].double().numpy()
-        place = pose[:2] - corner
-        ahead = nearest_ahead(route, place, config.lookahead)
-        aim = own.run(
-            "aim_point",
-            lambda ahead=ahead: ahead,
-            lambda f, place=place, ahead=ahead: same_shape(
-                f(route.xy.copy(), place.copy(), config.lookahead), ahead
-            ),
-        )
-        bearing, yaw = math.atan2(*(aim - place)[::-1]), float(pose[3])
-        both = torch.tensor([bearing]), torch.tensor([yaw])
-        rate = own.run(
-            "turn_rate",
-            lambda both=both: turn_rate(*both, limit).numpy(),
-            lambda f, b=bearing, y=yaw: same_shape(f(np.array([b]), np.array([y]), limit), [0]),
-        )
-        step = min(int(np.hypot(*(route.xy - place).T).argmin()), len(route.policies) - 1)
-        wanted.append(int(route.policies[step]))
-        history = np.array(wanted)
-        active = own.run(
-            "active_policies",
-            lambda history=history: held(history, config.hold_steps),
-            lambda f, history=history: same_shape(f(history, config.hold_steps), history),
-        )
-        policy = int(active[-1])
-        env.command[0, 0] = speed * float(slowdown(*both, env.config.slowest))
-        env.command[0, 2] = float(rate[0])
-        with torch.inference_mode():
-            observations = env.get_observations()
-            command = torch.tensor([specialists[policy].command])
-            f = specialists[policy].feasibility.feasibility(env.patches(), command)
-            _, _, _, extras = env.step(specialists[policy].act(observations))
-        after, velocity = env.motion()
-        moved = after[0].double().numpy() - [*corner, 0, 0]
-        seen["pose"].append(moved)
-        seen["policy"].append(policy)
-        seen["velocity"].append(velocity[0, :2].double().numpy())
-        seen["command"].append(env.command[0, :2].double().numpy().copy())
-        seen["f"].append(float(f[0]))
-        if bool(extras["fell"][0]):
-            reason = "fell"
-        elif np.hypot(*(moved[:2] - route.xy[-1])) <= config.goal_radius:
-            reason = "reached"
-        if reason != "timeout":
-            break
-    measured = {name: np.array(values) for name, values in seen.items()}
-    poses = measured["pose"]
-    episode = Episode(
-        success=reason == "reached",
-        reason=reason,
-        poses=poses,
-        policies=measured["policy"],
-        length=float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()),
-        seconds=len(poses) * env.control_dt,
-        robot="toy",
-    )
-    return episode, measured
-
-
-def rewarded(own: Stages, measured: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return r_v of every step of a drive (Eq. 1)."""
-    velocity, command = measured["velocity"], measured["command"]
-    ours = tracking_reward(torch.tensor(velocity), torch.tensor(command)).numpy()
-    return own.run(
-        "tracking_reward",
-        lambda: ours,
-        lambda f: same_shape(f(velocity.copy(), command.copy()), ours),
-    )
-
-
-def labelled(own: Stages, r_v: np.ndarray, fell: bool) -> np.ndarray:
-    """Return the label of every step of a drive, the mean of r_v over the second that follows."""
-    fallen = np.zeros(len(r_v), dtype=bool)
-    fallen[-1] = fell
-    counted = np.where(fallen, 0.0, r_v)
-    ours = np.array([counted[t : t + WINDOW].mean() for t in range(len(r_v))])
-    return own.run(
-        "labels", lambda: ours, lambda f: same_shape(f(r_v.copy(), fallen.copy(), WINDOW), ours)
     )

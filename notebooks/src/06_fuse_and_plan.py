@@ -409,7 +409,8 @@ draw_elevation(L)
 # %% [markdown]
 # Plan from the low side to the high side and back. The opponent is a **traversability** map (after
 # Wermelinger et al., 2016): slope, height of a step and roughness of each cell against critical
-# values. We let it use our policy map and switch for free. Its critical values:
+# values. Our policy map says which policy drives; the costmap knows of none, so its switches are
+# free. Its critical values:
 
 # %%
 from fgtutor.baselines import TraversabilityConfig
@@ -427,11 +428,11 @@ predict(
 )
 
 # %%
-from fgtutor.baselines import AssessedMap, classical_switched, find_route, ours, traversability
+from fgtutor.baselines import AssessedMap, Switched, find_route, ours, traversability
 
 
 def costmap(critical):
-    return lambda ground: classical_switched(lambda M, r: traversability(M, r, critical), ground)
+    return Switched(lambda M, r: traversability(M, r, critical))
 
 
 ground = AssessedMap(L, zoo)
@@ -440,8 +441,7 @@ routes = {}
 for way, ends in {"up": (low_side, high_side), "down": (high_side, low_side)}.items():
     routes[f"ours, {way}"] = find_route(ours, ground, *ends)
     for name, critical in {"as published": cautious, "raised": bold}.items():
-        found = find_route(costmap(critical), ground, *ends, switch_cost=0.0)
-        routes[f"{name}, {way}"] = found
+        routes[f"{name}, {way}"] = find_route(costmap(critical), ground, *ends)
 
 # %%
 compare_routes(L, routes, columns=3)
@@ -475,7 +475,7 @@ for seed in range(1, 40, 2):
 
 # %%
 ends = corridor.start, corridor.goal
-refused = find_route(costmap(bold), ground, *ends, switch_cost=0.0)
+refused = find_route(costmap(bold), ground, *ends)
 assert answer and not refused
 compare_routes(corridor.elevation, {"ours": answer, "costmap, raised": refused}, columns=1)
 

@@ -298,9 +298,7 @@ draw_rates(rates, title="How well must the robot know where it is?")
 # robot (notebook 06), while our policy map says who drives. The ground is new to all.
 
 # %%
-from functools import partial
-
-from fgtutor.baselines import TraversabilityConfig, classical_switched, planners, traversability
+from fgtutor.baselines import Switched, TraversabilityConfig, planners, traversability
 
 
 def cells(elevation, radius):
@@ -310,7 +308,7 @@ def cells(elevation, radius):
 kinds = ["steps", "gaps", "slopes", "rubble", "mixed"]
 everyone = load_zoo("toy", include_general=True)
 chosen = {name: planners(everyone)[name] for name in [*kinds[:4], "ours", "general"]}
-costmap = {"costmap": partial(classical_switched, cells)}
+chosen["costmap"] = Switched(cells)
 trials = budget(fast=4, full=20, unit="trials per field, 35 fields", each=3.0)
 
 # %%
@@ -319,19 +317,15 @@ from tqdm import tqdm
 from fgtutor.evaluation.trials import Ground, drive
 from fgtutor.planning import PlanSettings
 
-ours, free = PlanSettings(), PlanSettings(switch_cost=0.0)  # a costmap may switch for free
 rows = []
 for kind in tqdm(kinds):
     tiles = [make_terrain(kind, robot="toy", seed=2 * i + 1) for i in range(trials)]
     grounds = [Ground(terrain=tile, seeds=(i,)) for i, tile in enumerate(tiles)]
-    rows += drive(grounds, chosen, everyone, settings=ours)
-    rows += drive(grounds, costmap, everyone, settings=free)
+    rows += drive(grounds, chosen, everyone, settings=PlanSettings())
 
 # %%
 from fgtutor.figures.charts import draw_table
 from fgtutor.statistics import wilson_interval
-
-contestants = [*chosen, *costmap]
 
 
 def crossed(kind, name):
@@ -343,13 +337,13 @@ def with_interval(count):
     return f"{count}\n{low:.0%}-{high:.0%}"
 
 
-counts = np.array([[crossed(kind, name) for name in contestants] for kind in kinds])
+counts = np.array([[crossed(kind, name) for name in chosen] for kind in kinds])
 
 # %%
 draw_table(
     counts / trials,
     kinds,
-    contestants,
+    [*chosen],
     title="Who reaches the goal (column), on which terrain (row)?",
     caption=f"Successes of {trials}, and the 95 % interval of the rate",
     texts=[[with_interval(value) for value in row] for row in counts],
@@ -371,7 +365,7 @@ print("on its own terrain:", specialists.diagonal(), " ours:", team[:4], " of", 
 # %%
 from collections import Counter
 
-for name in contestants:
+for name in chosen:
     print(f"{name:8}", dict(Counter(row.outcome for row in rows if row.policy == name)))
 
 # %% [markdown]

@@ -95,13 +95,18 @@ predict("A robot walks with a mean r_v of 0.3 and does not fall.", ["up", "down"
 
 # %%
 assert rule.demote_below < 0.3 < rule.promote_above
-reveal("It stays: neither bored nor lost. So every robot finds its own difficulty.")
-print(f"\na new episode after {rule.episode_seconds:.0f} s, a fall,")
-print(f"or {rule.stuck_seconds} s without moving {100 * rule.stuck_progress:.0f} cm")
+reveal("it stays")
 
 # %% [markdown]
-# The last line matters. Without it, a robot that stops before each step would never fall and keep
-# its row. *Waiting must not pay.*
+# So every robot finds the row where it is neither bored nor lost. And when does an episode end?
+
+# %%
+print(f"after {rule.episode_seconds:.0f} s, at a fall,")
+print(f"or after {rule.stuck_seconds} s without moving {100 * rule.stuck_progress:.0f} cm")
+
+# %% [markdown]
+# The last line matters. Without it, a robot that stops before each step would never fall and would
+# keep its row. *Waiting must not pay.*
 
 # %% [markdown]
 # ## Was that action better than expected?
@@ -196,12 +201,12 @@ draw_curves(
 
 # %%
 assert clipped(0.5, -1) == clipped(0.6, -1) and clipped(1.3, 1) == clipped(1.4, 1)  # flat
-reveal("No: below 0.8 the lower curve is flat. It has been pushed far enough for one rollout.")
+reveal("no")
 
 # %% [markdown]
-# *What to see:* each curve is flat on the side where the policy has already done what it should. On
-# the other side it is not: a mistake can always be taken back
-# ([derivation](../docs/derivations.md#ppos-clip)).
+# *What to see:* each curve is flat on the side where the policy has already done what it should: it
+# has been pushed far enough for one rollout. On the other side it is not flat: a mistake can always
+# be taken back ([derivation](../docs/derivations.md#ppos-clip)).
 
 # %% [markdown]
 # ## Train, stop, go on
@@ -234,13 +239,9 @@ import signal
 from dataclasses import replace
 
 from fgtutor import train
-from fgtutor.course.widgets.live_curve import LiveCurve
-
-live = LiveCurve()
 
 
 def impatient(row):
-    live(row)
     if row["iteration"] == iterations // 2:
         signal.raise_signal(signal.SIGINT)
 
@@ -255,9 +256,11 @@ print(f"stopped: {half.provenance['samples']:,} samples so far, the walker's inc
 # this package says so).
 
 # %%
-again = LiveCurve()
-mine = train(replace(config, resume=True), on_iteration=again)
-again.draw(mine.provenance["curve"])
+from fgtutor.course.widgets.live_curve import LiveCurve
+
+live = LiveCurve()
+mine = train(replace(config, resume=True), on_iteration=live)
+live.draw(mine.provenance["curve"])
 assert len(mine.provenance["curve"]) == iterations
 
 # %% [markdown]
@@ -304,8 +307,8 @@ assert off < truth.square().mean().sqrt(), "worse than always estimating 0"
 print(f"off by {off:.2f} m/s (root mean square), after {iterations} iterations")
 
 # %% [markdown]
-# *What to see:* the estimate follows, with an error. The longer the encoder is trained, the smaller
-# the error; with a budget of seconds it is large.
+# *What to see:* the estimate follows the truth, with an error that shrinks as the encoder is
+# trained. Where both drop to 0, a new episode begins.
 
 # %% [markdown]
 # ## What the walker is worth
@@ -318,7 +321,7 @@ from fgtutor.learning.training import Trainer
 
 count = budget(fast=4, full=20, unit="iterations", each=4.0)
 scratch, rates = Trainer(replace(config, start_from=None, out=Path("runs") / "09-from-nothing")), []
-scratch.algorithm.optimizer.register_step_post_hook(
+hook = scratch.algorithm.optimizer.register_step_post_hook(
     lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"])
 )
 
@@ -373,7 +376,8 @@ draw_curves(
 # %%
 jumps = np.abs(np.diff(np.log(rates)))
 assert len(rates) == 16 * count and jumps.max() < np.log(1.5) + 1e-6 and jumps.max() > 0.1
-reveal(f"A zig-zag: it jumped in {np.mean(jumps > 1e-6):.0%} of the updates, by a factor of 1.5.")
+print(f"it jumped in {np.mean(jumps > 1e-6):.0%} of the updates, by a factor of 1.5 at most")
+reveal("a zig-zag in equal jumps")
 
 # %% [markdown]
 # *What to see:* going up and down is normal. A rate that sinks to its floor of $10^{-5}$ and stays

@@ -116,8 +116,9 @@ draw_elevation(first.elevation, title="The map after one look")
 
 # %%
 known = first.elevation.known.mean()
-assert 0 < known < 0.6
-reveal(f"{known:.0%} of the cells hold at least {to_cells.min_points} points.")
+assert 0 < known < 0.2
+print(f"{known:.0%} of the cells hold at least {to_cells.min_points} points")
+reveal("under 20 %")
 
 # %% [markdown]
 # *What to see:* hatched cells were never seen. They are not flat, not free and not holes: they are
@@ -180,10 +181,11 @@ draw_table(
 
 # %%
 assert filled_up["highest point"] >= filled_up["median"] > 2 * filled_up["map_points"]
-reveal("Both: at the foot of a wall a scanner sees more wall than floor.")
+reveal("both")
 
 # %% [markdown]
-# *What to see:* the plain rules fill slots up. `map_points` therefore does four things:
+# *What to see:* both plain rules fill slots up, since at the foot of a wall a scanner sees more
+# wall than floor. `map_points` therefore does four things:
 #
 # 1. It removes **outliers**: points far from their nearest neighbours.
 # 2. It sorts points into cells and takes the **median**. Cells with fewer than two points stay
@@ -279,18 +281,23 @@ print(f"switches: {free.switches} if free, {priced.switches} at a price of 1 (me
 
 # %%
 from fgtutor import execute
-from fgtutor.course.a1_pictures import show_walk
 
-walk = execute(priced, terrain, {name: zoo[name] for name in priced.names})
-show_walk(walk, terrain, priced, count=3)
+execute(priced, terrain, {name: zoo[name] for name in priced.names})
 
 # %% [markdown]
 # ## How lost is the robot?
 #
 # So far the robot knew exactly where it was. In reality its estimate has two errors. Each position
-# fix is a little off, with a new error every time. And underneath a second error **drifts**. It is
-# a random walk: in every control step of $\Delta t$ a small random number is added, with variance
-# $\sigma_d^2\, \Delta t$. Here are twenty seconds, for three robots:
+# fix is a little off, by a new $n_t$ every time. And underneath a second error **drifts**: a random
+# walk, to which every control step of $\Delta t$ adds a small $d_s$:
+#
+# $$
+# e_t = n_t + \sum_{s \le t} d_s, \qquad
+# n_t \sim \mathcal N(0, \sigma_\text{fix}^2), \quad
+# d_s \sim \mathcal N(0, \sigma_\text{drift}^2\, \Delta t).
+# $$
+#
+# Here are twenty seconds, for three robots:
 
 # %%
 fix, drift, dt, seconds = 0.03, 0.01, 0.02, 20.0
@@ -323,7 +330,8 @@ draw_curves(
 # %%
 line = np.polyfit(t, variance, 1)
 assert np.abs(variance - np.polyval(line, t)).max() < 0.15 * variance[-1]
-reveal(f"The variance: a straight line that begins at {1e4 * line[1]:.0f} cm².")
+print(f"the line begins at {1e4 * line[1]:.0f} cm²")
+reveal("its variance")
 
 # %% [markdown]
 # *What to see:* a straight line that does not begin at 0. Independent errors add their variances,

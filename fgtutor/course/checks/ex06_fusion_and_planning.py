@@ -3,6 +3,16 @@
 import numpy as np
 
 from fgtutor.course.checks.question import Mistake, Question
+from fgtutor.course.checks.searches import (
+    after_fusing,
+    along_route,
+    both_ways,
+    cells_of_route,
+    cheapest,
+    fewest_steps,
+    step_lengths,
+    switching,
+)
 from fgtutor.directions import STEP_LENGTHS, STEPS
 
 
@@ -26,40 +36,6 @@ def _costs(rng: np.random.Generator) -> tuple:
     return costs, (0, int(rng.integers(4))), (4, int(rng.integers(4)))
 
 
-def _cheapest(costs: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> float:
-    """Relax all edges until nothing changes (Bellman-Ford)."""
-    nx, ny, _ = costs.shape
-    best = np.full((nx + 2, ny + 2), np.inf)
-    best[goal[0] + 1, goal[1] + 1] = 0.0
-    for _ in range(nx * ny):
-        onward = [
-            costs[..., k] + best[1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny]
-            for k, (dx, dy) in enumerate(STEPS)
-        ]
-        inner = best[1:-1, 1:-1]
-        better = np.minimum(inner, np.min(onward, axis=0))
-        if np.array_equal(better, inner):
-            break
-        best[1:-1, 1:-1] = better
-    return float(best[start[0] + 1, start[1] + 1])
-
-
-def _fewest_steps(costs: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> float:
-    toll = 1e4  # dearer than any route, so that the number of steps decides
-    return _cheapest(costs + toll, start, goal) % toll
-
-
-def _both_ways(costs: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> float:
-    """The cheaper of an edge's two directions, taken for both."""
-    around = np.pad(costs, ((1, 1), (1, 1), (0, 0)), constant_values=np.inf)
-    nx, ny, _ = costs.shape
-    back = [
-        around[1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny, (k + 4) % 8]
-        for k, (dx, dy) in enumerate(STEPS)
-    ]
-    return _cheapest(np.minimum(costs, np.stack(back, axis=-1)), start, goal)
-
-
 _WALL = (np.where((np.arange(4) == 1)[:, None, None], np.inf, np.ones((4, 3, 8))), (0, 1), (3, 1))
 """No edge leaves column 1, so the far side is out of reach."""
 _ON_THE_SPOT = (np.ones((3, 3, 8)), (1, 1), (1, 1))
@@ -68,78 +44,10 @@ _ONE_WAY = (np.where(np.arange(8) < 2, 1.0, 5.0) * np.ones((3, 2, 1)), (2, 0), (
 """Towards +x is cheap, and back is dear."""
 
 
-def _cells(
-    costs: np.ndarray, start: tuple[int, int], goal: tuple[int, int], last: bool = True
-) -> np.ndarray:
-    """Go down from start to goal by the cost that is left from each cell."""
-    if not np.isfinite(_cheapest(costs, start, goal)):
-        return np.zeros((0, 2), dtype=int)
-    cells, shape = [start], costs.shape[:2]
-    while cells[-1] != goal:
-        here = cells[-1]
-        onward = [(here[0] + int(dx), here[1] + int(dy)) for dx, dy in STEPS]
-        left = [
-            costs[(*here, k)] + _cheapest(costs, cell, goal)
-            if all(0 <= i < n for i, n in zip(cell, shape, strict=True))
-            else np.inf
-            for k, cell in enumerate(onward)
-        ]
-        cells.append(onward[int(np.argmin(left))])
-    return np.array(cells if last else cells[:-1])
-
-
 def _choices(rng: np.random.Generator) -> tuple:
     tensors = rng.uniform(0.05, 1, (2, 6, 3, 8))
     tensors[1, 0], tensors[0, 4] = 0.05, 0.05  # either policy has a column that it cannot leave
     return tensors, 0.3, float(rng.uniform(0.5, 2)), (0, int(rng.integers(3))), (5, 1)
-
-
-def _switching(
-    tensors: np.ndarray,
-    f_min: float,
-    switch_cost: float,
-    start: tuple[int, int],
-    goal: tuple[int, int],
-    *,
-    first: bool = False,
-    forbidden: bool = False,
-    every: bool = False,
-) -> float:
-    """Relax all moves and switches until nothing changes; the options make it wrong."""
-    policies, nx, ny, _ = tensors.shape
-    best = np.full((policies, nx + 2, ny + 2), np.inf)
-    best[:, goal[0] + 1, goal[1] + 1] = 0.0
-    costs = np.where(tensors >= f_min, 1 / tensors, np.inf) + (switch_cost if every else 0.0)
-    for _ in range(policies * nx * ny):
-        onward = [
-            costs[..., k] + best[:, 1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny]
-            for k, (dx, dy) in enumerate(STEPS)
-        ]
-        moved = np.minimum(best[:, 1:-1, 1:-1], np.min(onward, axis=0))
-        if not forbidden:
-            moved = np.minimum(moved, moved.min(axis=0) + (0.0 if every else switch_cost))
-        if np.array_equal(moved, best[:, 1:-1, 1:-1]):
-            break
-        best[:, 1:-1, 1:-1] = moved
-    return float(best[:, start[0] + 1, start[1] + 1].min() + first * switch_cost)
-
-
-def _after_fusing(
-    tensors: np.ndarray,
-    f_min: float,
-    switch_cost: float,
-    start: tuple[int, int],
-    goal: tuple[int, int],
-) -> float:
-    """Plan on the fused tensor, and pay for the switches afterwards."""
-    fused = tensors.max(axis=0)
-    cells = _cells(np.where(fused >= f_min, 1 / fused, np.inf), start, goal)
-    if not len(cells):
-        return np.inf
-    headings = (np.diff(cells, axis=0)[:, None] == STEPS).all(axis=-1).argmax(axis=-1)
-    policies = tensors.argmax(axis=0)[cells[:-1, 0], cells[:-1, 1], headings]
-    cost = (1 / _edges(fused, cells)).sum()
-    return float(cost + switch_cost * np.count_nonzero(np.diff(policies)))
 
 
 def _route(rng: np.random.Generator) -> tuple:
@@ -150,17 +58,6 @@ def _route(rng: np.random.Generator) -> tuple:
         if ((onward >= 0) & (onward < 6)).all():
             cells.append(onward)
     return fused, np.array(cells)
-
-
-def _edges(fused: np.ndarray, cells: np.ndarray, turn: int = 0, late: int = 0) -> np.ndarray:
-    steps = np.diff(cells, axis=0)
-    heading = (steps[:, None] == STEPS).all(axis=-1).argmax(axis=-1)
-    at = cells[late : len(cells) - 1 + late]
-    return fused[at[:, 0], at[:, 1], (heading + turn) % 8]
-
-
-def _lengths(cells: np.ndarray) -> np.ndarray:
-    return np.hypot(*np.diff(cells, axis=0).T)
 
 
 QUESTIONS = (
@@ -258,38 +155,38 @@ QUESTIONS = (
         "k] is paid for LEAVING a cell along heading k; infinity if no chain joins them.",
         draw=_costs,
         examples=(_WALL, _ON_THE_SPOT, _ONE_WAY),
-        truth=_cheapest,
+        truth=cheapest,
         mistakes=(
             Mistake(
                 "no answer where there is no route: a goal that cannot be reached costs infinity.",
-                lambda *case: np.nan_to_num(_cheapest(*case), posinf=0.0),
+                lambda *case: np.nan_to_num(cheapest(*case), posinf=0.0),
             ),
             Mistake(
                 "steps counted: each edge has a cost of its own, and the sum is asked for.",
-                lambda costs, start, goal: _cheapest(
+                lambda costs, start, goal: cheapest(
                     np.where(np.isfinite(costs), 1.0, np.inf), start, goal
                 ),
             ),
             Mistake(
                 "a search for the fewest steps: a longer route over easy ground may be cheaper.",
-                _fewest_steps,
+                fewest_steps,
             ),
             Mistake(
                 "a route from goal to start: up a step is not down a step.",
-                lambda costs, start, goal: _cheapest(costs, goal, start),
+                lambda costs, start, goal: cheapest(costs, goal, start),
             ),
             Mistake(
                 "an undirected graph: an edge and its reverse have costs of their own: use a "
                 "DiGraph.",
-                _both_ways,
+                both_ways,
             ),
             Mistake(
                 "costs times step length: the paper's edge cost is 1 / F for diagonals too.",
-                lambda costs, start, goal: _cheapest(costs * STEP_LENGTHS, start, goal),
+                lambda costs, start, goal: cheapest(costs * STEP_LENGTHS, start, goal),
             ),
             Mistake(
                 "a heading off by one: costs[..., k] belongs to STEPS[k].",
-                lambda costs, start, goal: _cheapest(np.roll(costs, 1, axis=-1), start, goal),
+                lambda costs, start, goal: cheapest(np.roll(costs, 1, axis=-1), start, goal),
             ),
         ),
         hints=(
@@ -308,31 +205,31 @@ QUESTIONS = (
         expects="the sum over its steps of 1 / F of the cell that is LEFT, along the step's "
         "heading: a route of n cells has n - 1 steps.",
         draw=_route,
-        truth=lambda fused, cells: (1 / _edges(fused, cells)).sum(),
+        truth=lambda fused, cells: (1 / along_route(fused, cells)).sum(),
         mistakes=(
             Mistake(
                 "the cell that is entered: F[ix, iy, k] is the feasibility of LEAVING (ix, iy).",
-                lambda f, c: (1 / _edges(f, c, late=1)).sum(),
+                lambda f, c: (1 / along_route(f, c, late=1)).sum(),
             ),
             Mistake(
                 "the opposite heading: the step leads from cells[i] to cells[i + 1], not back.",
-                lambda f, c: (1 / _edges(f, c, turn=4)).sum(),
+                lambda f, c: (1 / along_route(f, c, turn=4)).sum(),
             ),
             Mistake(
                 "a heading off by one: heading 0 is +x.",
-                lambda f, c: (1 / _edges(f, c, turn=1)).sum(),
+                lambda f, c: (1 / along_route(f, c, turn=1)).sum(),
             ),
             Mistake(
                 "the inverse of the sum: sum the costs of the steps, not their feasibilities.",
-                lambda f, c: 1 / _edges(f, c).sum(),
+                lambda f, c: 1 / along_route(f, c).sum(),
             ),
             Mistake(
                 "a mean over the steps: every step has to be paid.",
-                lambda f, c: (1 / _edges(f, c)).mean(),
+                lambda f, c: (1 / along_route(f, c)).mean(),
             ),
             Mistake(
                 "costs times step length: the paper's edge cost is 1 / F for diagonals too.",
-                lambda f, c: (_lengths(c) / _edges(f, c)).sum(),
+                lambda f, c: (step_lengths(c) / along_route(f, c)).sum(),
             ),
         ),
         hints=(
@@ -349,30 +246,32 @@ QUESTIONS = (
         "neighbour of the one before; an array of shape (0, 2) if there is no route.",
         draw=_costs,
         examples=(_WALL,),
-        truth=lambda costs, start, goal: _cells(costs, start, goal),
+        truth=lambda costs, start, goal: cells_of_route(costs, start, goal),
         mistakes=(
             Mistake(
                 "a route that begins at the goal: predecessors are followed backwards, so turn "
                 "the list around.",
-                lambda *case: _cells(*case)[::-1],
+                lambda *case: cells_of_route(*case)[::-1],
             ),
             Mistake(
                 "a route without its goal: the last cell belongs to it.",
-                lambda *case: _cells(*case, last=False),
+                lambda *case: cells_of_route(*case, last=False),
             ),
             Mistake(
                 "a route without its start: the first cell belongs to it.",
-                lambda *case: _cells(*case)[1:],
+                lambda *case: cells_of_route(*case)[1:],
             ),
             Mistake(
                 "the fewest steps: a longer route over easy ground may be cheaper.",
-                lambda costs, start, goal: _cells(costs + 1e4, start, goal),
+                lambda costs, start, goal: cells_of_route(costs + 1e4, start, goal),
             ),
             Mistake(
                 "a route from goal to start: costs[ix, iy, k] is paid for LEAVING a cell.",
-                lambda costs, start, goal: _cells(costs, goal, start)[::-1],
+                lambda costs, start, goal: cells_of_route(costs, goal, start)[::-1],
             ),
-            Mistake("swapped axes: each row is (ix, iy).", lambda *case: _cells(*case)[:, ::-1]),
+            Mistake(
+                "swapped axes: each row is (ix, iy).", lambda *case: cells_of_route(*case)[:, ::-1]
+            ),
         ),
         hints=(
             "Dijkstra as in question 3; whenever a cell gets a better cost, note from which cell "
@@ -391,34 +290,34 @@ QUESTIONS = (
         "first policy is free, and infinity says that there is no route.",
         draw=_choices,
         examples=((np.full((2, 3, 2, 8), 0.05), 0.1, 1.0, (0, 0), (2, 0)),),
-        truth=lambda tensors, f_min, switch_cost, start, goal: _switching(
+        truth=lambda tensors, f_min, switch_cost, start, goal: switching(
             tensors, f_min, switch_cost, start, goal
         ),
         mistakes=(
             Mistake(
                 "switches paid after the search: it must know of them while it searches, or it "
                 "takes the cheapest route for a robot that switches for nothing.",
-                _after_fusing,
+                after_fusing,
             ),
             Mistake(
                 "switches for nothing: every change of policy costs switch_cost.",
-                lambda t, f, s, start, goal: _switching(t, f, 0.0, start, goal),
+                lambda t, f, s, start, goal: switching(t, f, 0.0, start, goal),
             ),
             Mistake(
                 "one policy for the whole route: a switch is dear, not forbidden.",
-                lambda t, f, s, start, goal: _switching(t, f, s, start, goal, forbidden=True),
+                lambda t, f, s, start, goal: switching(t, f, s, start, goal, forbidden=True),
             ),
             Mistake(
                 "a first policy that is paid for: the robot may start with any policy.",
-                lambda t, f, s, start, goal: _switching(t, f, s, start, goal, first=True),
+                lambda t, f, s, start, goal: switching(t, f, s, start, goal, first=True),
             ),
             Mistake(
                 "a price on every step: only a CHANGE of policy costs.",
-                lambda t, f, s, start, goal: _switching(t, f, s, start, goal, every=True),
+                lambda t, f, s, start, goal: switching(t, f, s, start, goal, every=True),
             ),
             Mistake(
                 "closed steps used: below f_min a policy has no such step.",
-                lambda t, f, s, start, goal: _switching(t, 0.0, s, start, goal),
+                lambda t, f, s, start, goal: switching(t, 0.0, s, start, goal),
             ),
         ),
         hints=(

@@ -95,6 +95,13 @@ class Question:
     answer. A plain `def` that does its imports inside and uses no other global: its source is sent
     to the submission's process. The `truth` and the mistakes are then targets like the learner's.
     """
+    faults: Callable[..., dict[str, str]] | None = None
+    """Judges an answer that need not equal the truth: faults(answer, *arguments) gives sentences by
+    kind of fault, none for a good answer. It runs in the grader, and may know what the submission
+    was not given. A mistake is named by the kinds of its faults.
+    """
+    most: int = 0
+    """Most cases that are drawn, where each takes long; 0 for as many as are asked for."""
 
     @property
     def parameters(self) -> list[str]:
@@ -135,7 +142,8 @@ class Question:
         if self.draw is None:
             return None
         rng = np.random.default_rng((seed, zlib.crc32(self.id.encode())))
-        return [*self.examples, *(self.draw(rng) for _ in range(cases))]
+        drawn = min(cases, self.most or cases)
+        return [*self.examples, *(self.draw(rng) for _ in range(drawn))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,7 +211,13 @@ class Judge:
         That is often the formula itself, so a first try is better not told.
         """
         self.question, self.cases, self.tell = question, cases, tell
-        self.right = question.answers(question.truth, cases)
+        # Where faults are looked for, there is nothing to compare with.
+        self.right = (
+            [None] * len(cases or ())
+            if question.faults
+            else question.answers(question.truth, cases)
+        )
+        self._wrong_answers: dict[str, list[Any] | None] = {}
 
     def judge(self, reply: Mapping[str, Any]) -> Verdict:
         """Turn a reply of `replies.reply_of`, which may be forged or broken, into a verdict."""
@@ -218,11 +232,32 @@ class Judge:
             return Verdict(self.question, WRONG, self._changed(said.changed))
         if len(answers) != len(self.right):
             return Verdict(self.question, CRASHED, f"{len(answers)} answers to {len(self.right)}")
-        for number, (expected, got) in enumerate(zip(self.right, answers, strict=True)):
-            if text := self._difference(expected, got):
+        for number, got in enumerate(answers):
+            if text := self._what_is_wrong(number, got):
                 case = None if self.cases is None else number + 1
                 return Verdict(self.question, WRONG, self._wrong(number, text, answers), case)
         return Verdict(self.question, PASSED)
+
+    def _what_is_wrong(self, number: int, got: Any) -> str:
+        """Say what is wrong with the answer to a case; "" if nothing is."""
+        if self.question.faults:
+            return "\n".join(self._faults(number, got).values())
+        return self._difference(self.right[number], got)
+
+    def _same(self, number: int, one: Any, other: Any) -> bool:
+        """Return whether two answers to a case are the same, or have the same faults."""
+        if self.question.faults:
+            return self._faults(number, one).keys() == self._faults(number, other).keys()
+        return not self._difference(one, other)
+
+    def _faults(self, number: int, got: Any) -> dict[str, str]:
+        asked, case = self.question, (self.cases or ())[number]
+        if asked.faults is None:
+            return {}
+        try:
+            return asked.faults(got, *case)
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+            return {"form": f"Got {describe(got)}, which is not what was asked for."}
 
     def _difference(self, expected: Any, got: Any) -> str:
         asked = self.question
@@ -260,13 +295,23 @@ class Judge:
     def _recognise(self, answers: Sequence[Any]) -> Mistake | None:
         """Return the first typical mistake whose answers are these in every case."""
         for mistake in self.question.mistakes:
-            try:
-                wrong = self.question.answers(mistake.answer, self.cases)
-            except (ArithmeticError, LookupError, ValueError):
-                continue  # a mistake may not fit every case
-            if not any(self._difference(a, b) for a, b in zip(wrong, answers, strict=True)):
+            wrong = self._made_by(mistake)
+            if wrong is not None and all(
+                self._same(number, *pair)
+                for number, pair in enumerate(zip(wrong, answers, strict=True))
+            ):
                 return mistake
         return None
+
+    def _made_by(self, mistake: Mistake) -> list[Any] | None:
+        """Return what a mistake answers, worked out once; None if it does not fit every case."""
+        if mistake.says not in self._wrong_answers:
+            try:
+                answers = self.question.answers(mistake.answer, self.cases)
+            except (ArithmeticError, LookupError, ValueError):
+                answers = None
+            self._wrong_answers[mistake.says] = answers
+        return self._wrong_answers[mistake.says]
 
 
 def plain_text(text: Any, *, kept: str = "\n\\") -> str:
