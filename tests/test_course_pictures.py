@@ -20,7 +20,7 @@ from fgtutor.course.widgets.live_curve import LiveCurve
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, UnreachableError
 from fgtutor.execution import FollowConfig
-from fgtutor.figures import charts, maps, style, videos
+from fgtutor.figures import charts, maps, relief, style, videos
 from fgtutor.patches import PatchGrid
 from fgtutor.planning import as_networkx
 from fgtutor.routes import Refusal
@@ -159,7 +159,7 @@ def test_the_error_of_a_scan_is_white_where_there_is_none():
     scan = ElevationMap(np.where(np.arange(12).reshape(4, 3) < 8, 0.35, 0.3))
     axes = cloud_pictures.draw_error(scan, truth).axes[0]
     shown = np.asarray(axes.images[0].get_array())
-    np.testing.assert_allclose(shown[0, 3], maps.GROUND(0.5)[:3], atol=0.06)
+    np.testing.assert_allclose(shown[0, 3], relief.GROUND(0.5)[:3], atol=0.06)
     assert "minus the truth" in axes.get_title(loc="left")
 
 

@@ -16,6 +16,7 @@ from fgtutor.course.grading.grade import GradeConfig, grade
 from fgtutor.course.grading.replies import reply_of
 from fgtutor.errors import ConfigError, NotebookError
 
+CAPSTONE = "ex13"
 QUESTIONS = [question for exercise in EXERCISES for question in questions_of(exercise)]
 BY_ID = pytest.mark.parametrize("question", QUESTIONS, ids=lambda question: question.id)
 
@@ -28,9 +29,18 @@ def root(request):
 # What is asked ------------------------------------------------------------------------------------
 
 
-def test_the_course_asks_for_a_hundred_points():
+POINTS = {CAPSTONE: 30, "the other exercises": 100}
+"""What the course asks for; the capstone stands beside it."""
+
+
+def test_the_course_asks_for_a_hundred_points_and_the_capstone_for_its_own():
+    points = dict.fromkeys(POINTS, 0)
+    for question in QUESTIONS:
+        points[CAPSTONE if question.id.startswith(CAPSTONE) else "the other exercises"] += (
+            question.points
+        )
+    assert points == POINTS
     assert len(QUESTIONS) >= 36
-    assert sum(question.points for question in QUESTIONS) == 100
 
 
 @pytest.mark.parametrize("exercise", EXERCISES)
@@ -77,7 +87,7 @@ def test_cases_follow_from_the_seed(question):
     assert plain(3) == plain(3)
     if question.draw:
         assert plain(3) != plain(4)
-        assert len(question.cases(0, 2)) == len(question.examples) + 2
+        assert len(question.cases(0, 2)) == len(question.examples) + min(2, question.most or 2)
 
 
 def test_a_number_to_find_is_not_told():
@@ -106,7 +116,7 @@ def test_untouched_exercises_score_nothing_and_solutions_everything(root):
     for mark in solved:
         assert (mark.percent, mark.fault) == (100.0, ""), mark
     assert sum(mark.points for mark in untouched) == 0
-    assert sum(mark.points for mark in solved) == 100
+    assert sum(mark.points for mark in solved) == sum(POINTS.values())
 
 
 @pytest.mark.parametrize("exercise", EXERCISES)

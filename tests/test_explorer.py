@@ -15,7 +15,7 @@ from fgtutor.course.widgets.tau_pictures import TAU_CHOICES, TauPictures, tau_fi
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, OffMapError, ThresholdError
 from fgtutor.feasibility import ood_weight
-from fgtutor.figures import maps, style
+from fgtutor.figures import maps, panels, style
 from fgtutor.planning import plan_on_map
 from fgtutor.settings import PAPER, PlanSettings
 from fgtutor.tensorization import Assessment
@@ -195,7 +195,7 @@ def test_a_scene_has_the_figures_colours():
         compare(f"w {name}", maps.draw_weight(explorer.plan.weights[name], grid, name))
     for picture in scene.pictures.values():
         assert picture.shape == (7, 9, 3) and picture.dtype == np.uint8
-        assert np.abs(picture[unknown] / 255 - to_rgb(maps.UNKNOWN)).max() < 0.01
+        assert np.abs(picture[unknown] / 255 - to_rgb(panels.UNKNOWN)).max() < 0.01
     blocked = upright(explorer.best[0] < 0.95) & ~unknown
     assert 0 < blocked.sum() < blocked.size
     assert np.abs(scene.pictures["F"][blocked] / 255 - to_rgb(maps.BLOCKED)).max() < 0.01

@@ -118,7 +118,7 @@ def test_the_commonest_height_is_white_and_the_bar_names_both_ends():
     assert relief.usual_height(elevation) == pytest.approx(3.0)
     picture = maps.draw_elevation(elevation)
     axes = picture.axes[0]
-    white = np.asarray(maps.GROUND(0.5))[:3]
+    white = np.asarray(relief.GROUND(0.5))[:3]
     np.testing.assert_allclose(np.asarray(axes.images[0].get_array())[5, 0], white, atol=0.01)
     picture.canvas.draw()
     (bar,) = axes.child_axes

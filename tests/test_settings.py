@@ -173,11 +173,13 @@ def settings_given(source: str) -> list[str]:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem[:2])
 def test_notebooks_plan_by_our_settings_but_where_another_is_the_subject(path):
-    """06 shows the paper's beside ours, 10 varies f_min, 12 the price of a switch."""
+    """05 and 06 show the paper's beside ours, 10 varies f_min, 07 and 12 the price of a switch."""
     subject = {
+        "05": ["taus='paper'"],
         "06": ["settings=PAPER"] * 2,
+        "07": ["switch_cost=0.0", "switch_cost=8.0"],
         "10": ["f_min=f_min"],
-        "12": ["switch_cost=switch_cost"],
+        "12": ["switch_cost=price"],
     }
     ours_said_aloud = ("taus='calibrated'", "settings=PlanSettings()")
     given = [one for one in settings_given(path.read_text()) if one not in ours_said_aloud]

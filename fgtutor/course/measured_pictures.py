@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from fgtutor.course.checks import find, nets
+from fgtutor.course.checks.capstone import one_thread
 from fgtutor.course.crossing import WINDOW, driven, labelled, rewarded
 from fgtutor.course.drives import collect, drive_together, straight_route
 from fgtutor.course.route_pictures import draw_drive
@@ -37,13 +38,13 @@ from fgtutor.robots.crossings import EnvConfig
 from fgtutor.statistics import calibration, spl, wilson_interval
 from fgtutor.world.terrain import World, make_terrain
 
-END = 10
+END = 40
 """Last steps of a drive that are not drawn: their advantage is that of an end, not of a step."""
 ROBOTS, SECONDS = 24, 12.0
 """Robots of a rollout, and how long each drives, s."""
 HIDDEN, LATENT = 64, 8
 """Sizes of the net that is trained on a rollout."""
-UPDATES = 150
+UPDATES = 80
 """Updates by the joint loss, before the head alone is trained on."""
 GOAL, MOST = 0.05, 100
 """Calibration error that its training aims at, and updates that it may take."""
@@ -80,6 +81,7 @@ def draw_labels(own: Stages) -> Figure:
     )
 
 
+@one_thread()
 def draw_calibration(own: Stages) -> Figure:
     """Train a Feasibility-Net on a rollout; draw what it says of another one against what came."""
     patch, command, label = samples(own, rollout(0))
@@ -119,8 +121,8 @@ def draw_calibration(own: Stages) -> Figure:
 
     figure = calibration_plot(*own.run("reliability", lambda: ours, hers))
     figure.axes[0].set_title(
-        f"{figure.axes[0].get_title(loc='left')}\nJoint loss {losses[0]:.2f}, after {len(losses)} "
-        f"updates {losses[-1]:.2f}; then {updates} of the head",
+        f"{figure.axes[0].get_title(loc='left')}\nJoint loss {losses[0]:.1f} to "
+        f"{losses[-1]:.2f}; {updates} updates more",
         **TITLE,
         loc="left",
     )
@@ -140,7 +142,7 @@ class Head(nn.Module):
 
 
 def samples(own: Stages, seen: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return patches, commands and labels of a rollout, every fifth that can be trusted."""
+    """Return patches, commands and labels of a rollout, every twelfth that can be trusted."""
     tracking = seen["tracking"]
     r_v, failed, ended = tracking[1:].double().numpy().transpose(2, 0, 1)
     ours = tuple(part[:-1].numpy() for part in feasibility_labels(tracking, WINDOW))
@@ -149,7 +151,7 @@ def samples(own: Stages, seen: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tenso
         lambda: ours,
         lambda f: [same_shape(part, r_v) for part in f(r_v.copy(), failed > 0, ended > 0, WINDOW)],
     )
-    chosen = torch.tensor(np.flatnonzero(trusted.ravel())[::5])
+    chosen = torch.tensor(np.flatnonzero(trusted.ravel())[::12])
     patch, command = (seen[name][:-1].flatten(0, 1)[chosen] for name in ("patch", "command"))
     return patch, command, torch.tensor(label.ravel()).float()[chosen]
 
@@ -167,7 +169,7 @@ def fitted(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        losses.append(float(loss))
+        losses.append(float(loss.detach()))
     return net, losses
 
 

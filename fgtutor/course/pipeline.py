@@ -19,6 +19,7 @@ from fgtutor.course.measured_pictures import (
     draw_success,
 )
 from fgtutor.course.planner_pictures import (
+    draw_capstone,
     draw_crossing,
     draw_patch,
     draw_plan,
@@ -50,7 +51,10 @@ PICTURES: dict[str, tuple[Callable[[Stages], Figure], tuple[str, ...]]] = {
     "ex10": (draw_length, ("path_length", "spl")),
     "ex11": (draw_success, ("success_table", "wilson_interval")),
     "ex12": (draw_scan, ("rasterise", "localisation_std", "cheapest_with_switches")),
-    "ex13": (draw_crossing, (*ROUTE, "aim_point", "turn_rate", "active_policies", "drive")),
+    "ex13": (
+        draw_capstone,
+        ("face_map", *TENSORS, "aim_point", "turn_rate", "active_policies", "drive"),
+    ),
 }
 """For each exercise its picture, and the functions that show in it."""
 

@@ -5,6 +5,7 @@ Reads the stages with her functions; draws each on the corridor.
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from fgtutor.course.stages import (
     fused,
     library_plan,
     planned,
+    route_of,
     routed,
     same_shape,
     tensors,
@@ -37,13 +39,14 @@ from fgtutor.directions import NUM_HEADINGS
 from fgtutor.elevation import ElevationMap
 from fgtutor.figures.maps import draw_elevation, draw_route
 from fgtutor.figures.style import TITLE, Picture
+from fgtutor.routes import Route
 
 SWITCH = 2.0
 """What a change of policy costs, in steps over perfect ground."""
 
 
 def draw_patch(own: Stages) -> Figure:
-    """Draw the patch before the first gap's rim, and which way is up from every cell."""
+    """Draw a patch at the edge of the rubble, and how much higher the next cell along +x is."""
     grid, elevation = zoo()["steps"].grid, patches.prepare(corridor().elevation)
     pose = np.array([1.4, 2.0, math.radians(20)])
     offsets = grid.points.double().numpy()
@@ -118,6 +121,7 @@ def layers(panels: Mapping[str, np.ndarray], title: str) -> Picture:
     rows = figure.subplots(len(panels) + 1, 1, sharex=True)
     elevation = corridor().elevation
     draw_elevation(elevation, axes=rows[0], bare=True)
+    rows[0].set_aspect("auto")  # as wide as the maps below it
     x0, y0, x1, y1 = elevation.extent
     for axes, (name, values) in zip(rows[1:], panels.items(), strict=True):
         axes.imshow(
@@ -251,18 +255,21 @@ def draw_plan(own: Stages) -> Figure:
     elevation = corridor().elevation
     x0, y0, x1, y1 = elevation.extent
     image = upper.imshow(
-        best.max(axis=-1).T, origin="lower", extent=(x0, x1, y0, y1), vmin=0, vmax=1, aspect="auto"
+        best[..., 0].T, origin="lower", extent=(x0, x1, y0, y1), vmin=0, vmax=1, aspect="auto"
     )
     figure.colorbar(image, ax=upper, label="F_max")
-    upper.set_title("F_max along the best heading of each cell", **TITLE, loc="left")
+    upper.set_title("F_max along heading 0 (+x)", **TITLE, loc="left")
     draw_elevation(elevation, axes=lower, bare=True)
     draw_route(route, elevation, axes=lower)
-    counted = float((1 / route.feasibility).sum())
     cost = own.run(
-        "route_cost", lambda: counted, lambda f: float(f(best.copy(), route.cells.copy()))
+        "route_cost",
+        lambda: float((1 / route.feasibility).sum()),
+        lambda f: float(f(best.copy(), route.cells.copy())),
     )
     least = own.run(
-        "cheapest", lambda: counted, lambda f: float(f(edges(own, best).copy(), *ends()))
+        "cheapest",
+        lambda: float(library_plan(best, policy).costs.sum()),
+        lambda f: float(f(edges(own, best).copy(), *ends())),
     )
     thinking = own.run(
         "cheapest_switching",
@@ -270,9 +277,9 @@ def draw_plan(own: Stages) -> Figure:
         lambda f: float(f(every.copy(), F_MIN, SWITCH, *ends())),
     )
     lower.set_title(
-        f"The route: {route.length:.1f} m, cost {cost:.1f}; no route costs less than {least:.1f}\n"
-        f"If a switch costs {SWITCH:g}, its {route.switches} switches make that "
-        f"{cost + SWITCH * route.switches:.1f}; a planner that knows finds {thinking:.1f}",
+        f"The route: {route.length:.1f} m, cost {cost:.1f}; the least there is: {least:.1f}\n"
+        f"If a switch costs {SWITCH:g}: {cost + SWITCH * route.switches:.1f} with its "
+        f"{route.switches} switches; the best: {thinking:.1f}",
         **TITLE,
         loc="left",
     )
@@ -281,7 +288,28 @@ def draw_plan(own: Stages) -> Figure:
 
 def draw_crossing(own: Stages) -> Figure:
     """Draw the robot's drive over the route, with every stage of the planner."""
-    route = planned(own)
+    return crossed(own, planned(own))
+
+
+def draw_capstone(own: Stages) -> Figure:
+    """Draw the drive over the route that `face_map` plans from F_i, with its policies."""
+    every = tensors(own)
+
+    def hers(function: Any) -> Route:
+        cells, policies = (np.asarray(part) for part in function(every.copy(), F_MIN, *ends()))
+        best, policy = every.max(axis=0), every.argmax(axis=0)
+        route = route_of(cells, best, policy, 1 / np.maximum(best, F_MIN))
+        if policies.shape != route.policies.shape or not {*policies.tolist()} <= {
+            *range(len(every))
+        }:
+            raise ValueError("it does not name a policy for each step")
+        return replace(route, policies=policies.astype(int))
+
+    return crossed(own, own.run("face_map", lambda: routed(own, *fused(own, every)), hers))
+
+
+def crossed(own: Stages, route: Route) -> Figure:
+    """Draw the robot's drive over a route, dotted what it would be without physics."""
     episode, _ = driven(own, route)
     figure = draw_drive(episode, route, corridor().elevation)
     ghost = glided(own, route, episode.seconds / len(episode.poses))

@@ -296,10 +296,14 @@ def routed(
 
 
 def library_plan(best: np.ndarray, policy: np.ndarray, **options: Any) -> Route:
-    """Return the library's route by F_max and P; raises a `PlanningError` if there is none."""
+    """Return the library's route by F_max and P, each step at the paper's cost 1 / F.
+
+    Raises a `PlanningError` if there is none.
+    """
     terrain = corridor()
-    places = {"grid": terrain.elevation, "start": terrain.start, "goal": terrain.goal}
-    return plan(best, policy, names=tuple(zoo()), f_min=F_MIN, **places, **options).raise_for()
+    options |= {"grid": terrain.elevation, "start": terrain.start, "goal": terrain.goal}
+    options |= {"names": tuple(zoo()), "f_min": F_MIN, "cost": "inverse"}
+    return plan(best, policy, **options).raise_for()
 
 
 def ends() -> tuple[tuple[int, int], tuple[int, int]]:

@@ -196,6 +196,14 @@ else:
     assert offer == 4.75, f"got {offer}: the cost so far plus the cost of the arrow, 1 / F"
     print("Right.")
 
+
+# %%
+def tell(node, cost, settled):
+    waiting = sorted((cost[n], n) for n in cost if n not in settled)
+    print(f"settled {node} at {cost[node]:.2f}; frontier:", end=" ")
+    print(", ".join(f"{n} {c:.2f}" for c, n in waiting[:5]))
+
+
 # %%
 import heapq
 
@@ -214,12 +222,11 @@ def dijkstra(graph, start):
                 cost[neighbour], before[neighbour] = offer, node
                 heapq.heappush(frontier, (offer, neighbour))
         if len(settled) <= 5:
-            waiting = sorted((cost[n], n) for n in cost if n not in settled)
-            print(f"settled {node} at {cost[node]:.2f}; frontier:", end=" ")
-            print(", ".join(f"{n} {c:.2f}" for c, n in waiting[:5]))
+            tell(node, cost, settled)
     return settled, before
 
 
+# %%
 settled, before = dijkstra(graph, (0, 0))
 
 # %%

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from fgtutor.course.checks.capstone import one_thread
 from fgtutor.directions import STEPS
 
 F_MIN = 0.1
@@ -33,6 +34,7 @@ def map_case(rng: np.random.Generator) -> tuple:
 
 
 @lru_cache(maxsize=8)
+@one_thread()
 def _assessed(seed: int) -> tuple[dict[str, np.ndarray], Cell, Cell]:
     """Return F of each shipped specialist on a mixed map, and the cells of start and goal."""
     from fgtutor.specialist import load_zoo
@@ -72,7 +74,12 @@ def map_answers(
 
 
 def map_faults(
-    answer: Any, others: list[np.ndarray], newcomer: np.ndarray, f_min: float, start: Any, goal: Any
+    answer: Any,
+    others: list[np.ndarray],
+    newcomer: np.ndarray,
+    f_min: float,
+    start: Cell,
+    goal: Cell,
 ) -> dict[str, str]:
     """Return what is wrong with the routes before and after the newcomer joins."""
     found = {}
@@ -80,7 +87,8 @@ def map_faults(
         ("Before the newcomer joins", np.stack(others), answer[:2]),
         ("With the newcomer", np.stack([*others, newcomer]), answer[2:]),
     ):
-        for kind, says in _route_faults(*route, tensors, f_min, tuple(start), tuple(goal)).items():
+        cells, policies = route
+        for kind, says in _route_faults(cells, policies, tensors, f_min, start, goal).items():
             found[f"{kind}, {when}"] = f"{when}: {says}"
     return found
 
@@ -153,10 +161,7 @@ def face_map(
     tensors: np.ndarray, f_min: float, start: Cell, goal: Cell, flaw: str = ""
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the cells of the cheapest route and the policy of each step, or with a flaw."""
-    start, goal = tuple(start), tuple(goal)
     fused, policy = tensors.max(axis=0), tensors.argmax(axis=0)
-    if flaw == "mean":
-        fused = tensors.mean(axis=0)
     if flaw == "worst":
         policy = tensors.argmin(axis=0)
     costs = _costs(fused, f_min)
