@@ -329,7 +329,7 @@ def test_a_mistake_of_ours_names_the_file_and_stops_nobody_else(tmp_path, monkey
         ({"loading": float("nan")}, "loading: "),
         ({"workers": -1}, "workers: "),
         ({"learner": "name"}, "learner: "),
-        ({"exercise": "ex13"}, "no exercise 'ex13'"),
+        ({"exercise": "ex99"}, "no exercise 'ex99'"),
     ],
 )
 def test_impossible_settings_are_refused(fields, complaint):

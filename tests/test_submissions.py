@@ -144,8 +144,8 @@ def test_no_two_learners_become_one(one, other):
         ("ex12/ada.ipynb", "ex10", "ex10 by its metadata, ex12 by its folder"),
         ("ex12/ex10.ipynb", "", "ex10 by its name, ex12 by its folder"),
         ("ex10_ex11.ipynb", "", "ex10 and ex11 by its name"),
-        ("ex13_ada.ipynb", "", "ex13 by its name"),
-        ("ex13_ada.ipynb", "ex10", "ex10 by its metadata, ex13 by its name"),
+        ("ex14_ada.ipynb", "", "ex14 by its name"),
+        ("ex14_ada.ipynb", "ex10", "ex10 by its metadata, ex14 by its name"),
         ("ada.ipynb", "", "do not say"),
         ("ada.ipynb", "../ex01", "do not say"),
         ("ex\u0660\u0666.ipynb", "", "do not say"),  # digits, but not of a name of ours
