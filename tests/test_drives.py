@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from fgtutor.baselines import AssessedMap, find_route, ours
-from fgtutor.course.drives import Scripted, collect, daring_route, drive_together, straight_route
+from fgtutor.baselines import AssessedMap, find_route, ours, without_ood
+from fgtutor.course.drives import Scripted, collect, drive_together, straight_route
 from fgtutor.course.route_pictures import draw_drive
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
@@ -68,7 +68,7 @@ def test_a_route_of_strangers_is_refused(make_rolling):
         drive_together([(straight_route(ground, "gaps"), ground, 0)], {"steps": make_rolling()})
 
 
-def test_the_daring_route_goes_where_ours_refuses(make_rolling):
+def test_without_w_ood_a_route_goes_where_ours_refuses(make_rolling):
     """A net that promises little and knows nothing: L_recon is far above its taus everywhere."""
     heights = np.zeros((30, 10))
     heights[14:16] = 0.4
@@ -76,6 +76,6 @@ def test_the_daring_route_goes_where_ours_refuses(make_rolling):
     shy = make_rolling(f=0.02, quantiles={"0.5": 1e-9, "0.9": 2e-9, "0.95": 3e-9, "0.99": 4e-9})
     ground, ends = AssessedMap(wall, {"steps": shy}), ((0.55, 0.55), (2.45, 0.55))
     assert not find_route(ours, ground, *ends)
-    route = daring_route(ground, *ends)
+    route = find_route(without_ood, ground, *ends, f_min=1e-9).raise_for()
     assert len(route.headings) == 19 and route.names == ("steps",)
     assert route.feasibility == pytest.approx(0.02, abs=1e-6)

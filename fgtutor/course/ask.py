@@ -1,4 +1,4 @@
-"""Questions to the learner: predict, then see the result beside the prediction; unfold an answer.
+"""Questions to the learner: predict, then see the result beside the prediction.
 
 Reads what the learner chooses or types below a cell; gives it back beside the answer. Nothing here
 waits for anybody: a notebook that runs without a reader prints the question and, later, the answer.
@@ -114,25 +114,3 @@ def reveal(answer: str) -> Answer:
     if not _asked:
         raise ConfigError("nothing was predicted yet: run the cell with predict(...) first")
     return Answer(_asked[-1], str(answer))
-
-
-@dataclass(frozen=True)
-class Question:
-    """A question with an answer to unfold."""
-
-    text: str
-    """The question."""
-    answer: str
-    """The answer, which a page shows when it is asked for."""
-
-    def __repr__(self) -> str:
-        return f"{self.text}\n(Run this cell to unfold the answer.)"
-
-    def _repr_html_(self) -> str:
-        text, answer = html.escape(self.text), html.escape(self.answer)
-        return f"<details><summary>{text}</summary><p>{answer}</p></details>"
-
-
-def question(text: str, answer: str) -> Question:
-    """Return a self-test question whose answer is folded; show it as a cell's result."""
-    return Question(text, answer)

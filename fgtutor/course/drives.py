@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +17,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from fgtutor import directions
-from fgtutor.baselines import AssessedMap, find_route, without_ood
 from fgtutor.errors import ConfigError
 from fgtutor.execution import Episode, FollowConfig, execute_batch
 from fgtutor.io.validation import Positive, check_arguments
@@ -27,10 +25,6 @@ from fgtutor.robots.base import LocomotionEnv
 from fgtutor.routes import Route
 from fgtutor.specialist import Specialist
 from fgtutor.world.terrain import Terrain
-
-Point = tuple[float, float]
-HARDLY = 1e-9
-"""As good as no lower limit on feasibility: f is a sigmoid, and never quite 0."""
 
 
 @dataclass(frozen=True)
@@ -59,13 +53,20 @@ def straight_route(terrain: Terrain, name: str) -> Route:
 
 
 def collect(
-    env: LocomotionEnv, act: Callable[[TensorDict], Tensor], seconds: Positive
+    env: LocomotionEnv,
+    act: Callable[[TensorDict], Tensor],
+    seconds: Positive,
+    *,
+    progress: bool = True,
 ) -> dict[str, Float[Tensor, "time envs _"]]:
-    """Let the robots of `env` act for a while; return every observation group over time."""
+    """Let the robots of `env` act for a while; return every observation group over time.
+
+    `progress` shows a bar.
+    """
     check_arguments(collect, locals(), ConfigError)
     steps = round(seconds / env.control_dt)
     observations = [env.get_observations()]
-    for _ in tqdm(range(steps - 1), unit="step"):
+    for _ in tqdm(range(steps - 1), unit="step", disable=not progress):
         observations.append(env.step(act(observations[-1]))[0])
     groups = list(observations[0].keys())  # a TensorDict iterates over its batch, not its names
     return {name: torch.stack([step[name] for step in observations]) for name in groups}
@@ -84,12 +85,3 @@ def drive_together(
     """
     routes, terrains, seeds = zip(*jobs, strict=True) if jobs else ((), (), ())
     return execute_batch(routes, terrains, zoo, seeds=seeds, config=config)
-
-
-def daring_route(ground: AssessedMap, start: Point, goal: Point, **changes: Any) -> Route:
-    """Return the best route if every f is believed wherever it is asked, however low it is.
-
-    Where ours refuses, this one goes: it shows whether the refusal was wise. `changes` are those of
-    `find_route`. Raises the reason, a `PlanningError`, if there is no such route either.
-    """
-    return find_route(without_ood, ground, start, goal, f_min=HARDLY, **changes).raise_for()

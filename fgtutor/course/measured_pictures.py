@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from fgtutor.course.checks import find, nets
-from fgtutor.course.checks.capstone import one_thread
 from fgtutor.course.crossing import WINDOW, driven, labelled, rewarded
 from fgtutor.course.drives import collect, drive_together, straight_route
 from fgtutor.course.route_pictures import draw_drive
@@ -32,6 +31,7 @@ from fgtutor.course.stages import (
 from fgtutor.feasibility import feasibility_labels
 from fgtutor.figures.charts import calibration_plot, draw_curves, draw_table
 from fgtutor.figures.style import TITLE, Picture
+from fgtutor.io.machine import one_thread
 from fgtutor.robots import env_class
 from fgtutor.robots.a1.model import A1Config, build_spec
 from fgtutor.robots.crossings import EnvConfig

@@ -57,13 +57,11 @@ def read(folder: Path | None = None) -> dict[str, str]:
     if not text.startswith(HEADER):
         raise _damaged(path, "it does not begin as `check` begins it")
     kept = sections_of(text)
-    sums = {question: checksum for question, checksum in SECTION.findall(text)}
-    for question, source in kept.items():
-        if sums[question] != _checksum(source):
-            raise ConfigError(
-                f"the section of {question} in {path} was changed by hand, so it may no longer "
-                f'pass: undo the change, or call reset("{question}") and check it again'
-            )
+    if changed := _changed(text):
+        raise ConfigError(
+            f"the section of {changed[0]} in {path} was changed by hand, so it may no longer "
+            f'pass: undo the change, or call reset("{changed[0]}") and check it again'
+        )
     if text != _text(kept):
         raise _damaged(path, "it holds more than its sections, or a section is incomplete")
     return kept
@@ -108,9 +106,7 @@ def reset(question: str = "", folder: Path | None = None) -> str:
         kept = sections_of(text)
         if not text.startswith(HEADER) or question not in kept:
             raise
-        rest = {name: source for name, source in kept.items() if name != question}
-        sums = {name: checksum for name, checksum in SECTION.findall(text)}
-        if any(sums[name] != _checksum(source) for name, source in rest.items()):
+        if any(name != question for name in _changed(text)):
             raise
     if question not in kept:
         return f"nothing is kept for {question}"
@@ -181,6 +177,12 @@ def _statements(source: str) -> dict[str, str]:
                 what = alias.name if alias.asname else name if not module else alias.name
                 found[name] = f"{module} {what}"
     return found
+
+
+def _changed(text: str) -> list[str]:
+    """Return the questions whose sections are not as `keep` wrote them."""
+    sums = dict(SECTION.findall(text))
+    return [name for name, source in sections_of(text).items() if sums[name] != _checksum(source)]
 
 
 def _checksum(source: str) -> str:

@@ -31,7 +31,7 @@ from tqdm import tqdm
 
 from fgtutor import __version__
 from fgtutor.errors import ConfigError, EvaluationError, FgtutorError, MissingExtraError
-from fgtutor.io.machine import usable_cores
+from fgtutor.io.machine import one_thread, usable_cores
 
 Row = dict[str, Any]
 """One trial, as JSON keeps it."""
@@ -113,7 +113,8 @@ def _work(name: str, pickled: bytes) -> Result | FgtutorError:
     try:
         task: Task = pickle.loads(pickled)
         began = time.perf_counter()
-        with _one_thread():
+        # A task has one core. If it needs torch, unpickling it has imported torch.
+        with one_thread() if "torch" in sys.modules else nullcontext():
             rows = task.function(*task.arguments)
         return Result(rows=rows, seconds=time.perf_counter() - began, machine=machine())
     except FgtutorError as error:
@@ -123,21 +124,6 @@ def _work(name: str, pickled: bytes) -> Result | FgtutorError:
             f"task {name} failed; the finished ones are kept, correct this and run again:\n"
             f"{traceback.format_exc()}"
         )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep torch to one thread: a task has one core, and sums then round alike everywhere."""
-    torch = sys.modules.get("torch")  # if a task needs it, unpickling the task has imported it
-    if torch is None:
-        yield
-        return
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _finished(tasks: Sequence[Task], submit: Submit, at_once: int) -> Iterator[tuple[Task, Result]]:

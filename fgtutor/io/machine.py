@@ -1,14 +1,15 @@
 """Cores and memory that this process may use, also within a container or a batch job.
 
 Reads the scheduler's affinity, free memory, and the limits of Linux's control groups, versions 1
-and 2; gives a number of cores and of bytes. Sources: sched_getaffinity(2); the kernel's cgroup-v2
-"cpu.max" and "memory.max", and cgroup-v1 "cpu.cfs_quota_us" and "memory.limit_in_bytes".
+and 2; gives a number of cores and of bytes, and holds torch to one thread. Sources:
+sched_getaffinity(2); the kernel's cgroup-v2 "cpu.max" and "memory.max", and cgroup-v1
+"cpu.cfs_quota_us" and "memory.limit_in_bytes".
 """
 
 import math
 import os
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psutil
@@ -17,6 +18,19 @@ from fgtutor.errors import TooLargeError
 
 ALWAYS_LEFT = 2**28
 """Bytes that any machine has left; for fewer, nothing is read (a confined process may not)."""
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute in one thread: on a busy core more mostly wait, and sums round alike."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def usable_cores(root: Path = Path("/")) -> int:

@@ -5,14 +5,13 @@ and judges its nets and routes by what it is not told: the labels on held-out gr
 of the cheapest route (Secs. III-A to III-C).
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fgtutor.directions import STEPS
+from fgtutor.io.machine import one_thread
 
 if TYPE_CHECKING:
     import torch
@@ -35,19 +34,6 @@ RELIEF = 0.03
 CALIBRATED, EXPLAINED, TOLD_APART = 0.1, 0.85, 0.8
 """Demands: largest calibration error, largest squared error as a share of the labels' variance,
 and least AUROC of L_recon."""
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch compute in one thread: with small nets on a busy machine, more mostly wait."""
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 # A net of one's own -------------------------------------------------------------------------------
@@ -75,6 +61,7 @@ def _rolled(first: int) -> "Rollout":
     """Let wheels roll over slopes of all heights, at commands from a walk to a run."""
     import torch
 
+    from fgtutor.course.drives import collect
     from fgtutor.feasibility import feasibility_labels
     from fgtutor.learning.calibrate import Rollout
     from fgtutor.robots.crossings import EnvConfig
@@ -86,13 +73,7 @@ def _rolled(first: int) -> "Rollout":
         for i in range(ROBOTS)
     ]
     env = ToyEnv(World([tiles]), ROBOTS, seed=first, config=EnvConfig(speed=(0.3, 1.5)))
-    observed = env.get_observations()
-    seen: dict[str, list[torch.Tensor]] = {"patch": [], "command": [], "tracking": []}
-    for _ in range(round(6.0 / env.control_dt)):
-        for name, values in seen.items():
-            values.append(observed[name].clone())
-        observed, *_ = env.step(torch.zeros(env.num_envs, env.num_actions))
-    rollout = {name: torch.stack(values) for name, values in seen.items()}
+    rollout = collect(env, lambda seen: torch.zeros(len(seen), 4), 6.0, progress=False)
     label, trusted = feasibility_labels(rollout["tracking"], round(1.0 / env.control_dt))
     return Rollout(rollout["patch"][trusted], rollout["command"][trusted], label[trusted])
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fgtutor.course.checks.capstone import one_thread
 from fgtutor.directions import STEPS
+from fgtutor.io.machine import one_thread
 
 F_MIN = 0.1
 """Least feasibility of an edge."""
