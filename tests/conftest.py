@@ -18,6 +18,7 @@ from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 
+from fgtutor.course import checks
 from fgtutor.feasibility import FeasibilityNet
 from fgtutor.patches import PatchGrid
 from fgtutor.robots.toy import ToyEnv
@@ -114,3 +115,13 @@ def zoo(make_rolling, tmp_path) -> Path:
     for name, f in (("steps", 0.8), ("gaps", 0.05), ("general", 0.6)):
         save_specialist(make_rolling(name, f=f), tmp_path / "zoo" / name)
     return tmp_path / "zoo"
+
+
+@pytest.fixture
+def new_learner(tmp_path, monkeypatch):
+    """Work in a folder of its own, in a kernel that has passed nothing."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(checks, "_passed", set())
+    monkeypatch.setattr(checks, "_tried", set())
+    monkeypatch.setattr(checks, "_hints", {})
+    return tmp_path

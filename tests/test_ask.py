@@ -45,18 +45,31 @@ def test_what_is_shown_cannot_break_the_page():
     assert "<script>" not in ask.reveal("no")._repr_html_()
 
 
-def test_a_field_keeps_what_is_chosen(monkeypatch):
+def test_a_field_keeps_what_is_chosen(monkeypatch, capsys):
     widgets = pytest.importorskip("ipywidgets", reason="the lab extra is not installed")
     display = pytest.importorskip("IPython.display")
-    shown = []
+    shown, columns = [], []
     monkeypatch.setattr("IPython.get_ipython", object)
-    monkeypatch.setattr(display, "display", shown.append)
-    ask.predict("Which way is harder?", ["up", "down"])
+    monkeypatch.setattr(display, "display", lambda data, **options: shown.append((data, options)))
+
+    class Column(widgets.VBox):
+        def __init__(self, children):
+            super().__init__(children)
+            columns.append(self)
+
+    monkeypatch.setattr(widgets, "VBox", Column)
+    ask.predict("Is 1 < 2?", ["yes", "no"])
     ask.predict("How far?")
-    radio, line = shown
+    assert capsys.readouterr().out == ""  # what is shown live is not printed too
+    data, options = shown[0]
+    assert data["text/plain"] == "Predict first: Is 1 < 2?\n  a) yes\n  b) no"
+    assert options["metadata"] == ask.ALONE and len(data) > 1
+    heading, radio = columns[0].children
+    assert "Is 1 &lt; 2?" in heading.value
+    line = columns[1].children[1]
     assert isinstance(radio, widgets.RadioButtons) and radio.value is None
-    radio.value, line.value = "down", "2 m"
-    assert [one.said for one in ask._asked] == ["down", "2 m"]
+    radio.value, line.value = "no", "2 m"
+    assert [one.said for one in ask._asked] == ["no", "2 m"]
 
 
 def test_questions_without_meaning_are_refused():

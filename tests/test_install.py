@@ -21,7 +21,7 @@ def pins() -> dict[str, str]:
 
 
 def test_everything_that_fgtutor_brings_is_pinned(pins):
-    brought, ahead = set(), [("fgtutor", frozenset({"lab", "dev", "cluster"}))]
+    brought, ahead = set(), [("fgtutor", frozenset({"lab", "dev", "cluster", "site"}))]
     while ahead:
         name, extras = ahead.pop()
         if (name, extras) in brought:

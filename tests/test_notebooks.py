@@ -36,7 +36,10 @@ for _ in tqdm(range(3)):
 from IPython.display import display
 words = {"image/png": {"alt": "noise in many colours", "width": 4}}
 display({"image/png": PNG, "text/html": "<b>one</b>"}, metadata=words, raw=True)
-display({"application/vnd.jupyter.widget-view+json": {"model_id": "1"}}, raw=True)
+widget = {"application/vnd.jupyter.widget-view+json": {"model_id": "1"}, "text/plain": "a slider"}
+display(widget, raw=True)
+from fgtutor.course.ask import ALONE
+display(widget | {"text/plain": "a question"}, metadata=ALONE, raw=True)
 """
 
 
@@ -129,7 +132,8 @@ def test_a_build_keeps_text_and_pictures_and_is_the_same_twice(tmp_path, monkeyp
     assert text.outputs[0].text == "fast: 0\n"
     assert text.outputs[1].data == {"text/plain": "[]"}  # an empty folder of its own
     assert bar.outputs == []
-    (picture,) = shown.outputs  # the widget has gone
+    picture, question = shown.outputs  # the widgets have gone
+    assert question.data == {"text/plain": "a question"} and question.metadata == {}
     assert picture.data.keys() == {"image/png"}
     assert picture.metadata == {"image/png": {"alt": "noise in many colours"}}
     assert find_drift(tmp_path) == {}

@@ -11,6 +11,8 @@ from typing import Any
 
 from fgtutor.errors import ConfigError, MissingExtraError
 
+ALONE = {"text/plain": {"alone": True}}
+"""Metadata of an output whose text tells as much as its widget, so that it is kept without one."""
 OPEN = "nothing"
 """What stands for a prediction that was not made."""
 
@@ -26,6 +28,13 @@ class Prediction:
     said: str = ""
     """The learner's prediction; empty until there is one."""
 
+    @property
+    def text(self) -> str:
+        """The question and its choices, a line each."""
+        letters = zip("abcdefghijklmnopqrstuvwxyz", self.choices, strict=False)
+        lines = [f"  {letter}) {choice}" for letter, choice in letters]
+        return "\n".join([f"Predict first: {self.prompt}", *lines])
+
 
 _asked: list[Prediction] = []
 """The questions put so far; `reveal` answers the last one."""
@@ -34,8 +43,9 @@ _asked: list[Prediction] = []
 def predict(prompt: str, choices: Sequence[str] | None = None) -> None:
     """Ask for a prediction; what the learner says is kept until `reveal`.
 
-    Prints the question and goes on at once. In a live notebook a list of the choices, or a line to
-    write on, stands below it. Raises `ConfigError` for an empty question or fewer than two choices.
+    Asks and goes on at once. In a live notebook a list of the choices, or a line to write on,
+    stands below the question; elsewhere it is printed. Raises `ConfigError` for an empty question
+    or fewer than two choices.
     """
     options = tuple(choices or ())
     if not prompt.strip():
@@ -44,23 +54,24 @@ def predict(prompt: str, choices: Sequence[str] | None = None) -> None:
         raise ConfigError(f"give at least two choices, or leave them out, got {choices!r}")
     question = Prediction(prompt, options)
     _asked.append(question)
-    print(f"Predict first: {prompt}")
-    for letter, choice in zip("abcdefghijklmnopqrstuvwxyz", options, strict=False):
-        print(f"  {letter}) {choice}")
-    _show_field(question)
+    if not _show_field(question):
+        print(question.text)
 
 
-def _show_field(question: Prediction) -> None:
-    """Show what takes the prediction, where there is a notebook that can."""
+def _show_field(question: Prediction) -> bool:
+    """Show the question with what takes the prediction; return whether a notebook can.
+
+    Where nothing is live, as on a page without a kernel, the same output reads as text.
+    """
     try:
         from IPython import get_ipython  # pyright: ignore[reportPrivateImportUsage]
         from IPython.display import display
 
         from fgtutor.course.widgets.still import w
     except (ImportError, MissingExtraError):
-        return
+        return False
     if get_ipython() is None:
-        return
+        return False
     field: Any
     if question.choices:
         field = w.RadioButtons(options=question.choices, value=None, layout={"width": "auto"})
@@ -71,7 +82,11 @@ def _show_field(question: Prediction) -> None:
         question.said = change["new"] or ""
 
     field.observe(take, "value")
-    display(field)
+    heading = w.HTML(f"<b>Predict first:</b> {html.escape(question.prompt)}")
+    live = w.VBox([heading, field])._repr_mimebundle_()
+    data = live[0] if isinstance(live, tuple) else live or {}
+    display({**data, "text/plain": question.text}, metadata=ALONE, raw=True)
+    return True
 
 
 class Answer:

@@ -13,7 +13,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from fgtutor.course.stages import Stages, corridor, same_shape, zoo
+from fgtutor.course.own_net import WINDOW
+from fgtutor.course.stages import corridor, zoo
+from fgtutor.course.substitutes import Stages, same_shape
 from fgtutor.execution import Episode, FollowConfig
 from fgtutor.feasibility import tracking_reward
 from fgtutor.robots import env_class
@@ -21,8 +23,6 @@ from fgtutor.robots.steering import slowdown, turn_rate
 from fgtutor.routes import Route
 from fgtutor.world.terrain import World
 
-WINDOW = 25
-"""Control steps that a label is the mean of: one second."""
 DRIVEN = 1500
 """Control steps after which a drive is given up: a minute."""
 

@@ -65,8 +65,7 @@ def build(master: Path) -> Built:
         if cell.cell_type == "markdown":
             cell.source = HEADING.sub(
                 lambda match: (
-                    f"## {match[1]} · {questions[match[1]].title} "
-                    f"({questions[match[1]].points} points)"
+                    f"## {match[1]} · {questions[match[1]].title} ({questions[match[1]].worth})"
                 ),
                 cell.source,
             )

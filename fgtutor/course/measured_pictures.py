@@ -11,54 +11,23 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import torch
 from matplotlib.figure import Figure
-from torch import Tensor, nn
 
-from fgtutor.course.checks import find, nets
-from fgtutor.course.crossing import WINDOW, driven, labelled, rewarded
-from fgtutor.course.drives import collect, drive_together, straight_route
+from fgtutor.course import own_net
+from fgtutor.course.checks import find
+from fgtutor.course.crossing import driven, labelled, rewarded
+from fgtutor.course.drives import drive_together, straight_route
 from fgtutor.course.route_pictures import draw_drive
-from fgtutor.course.stages import (
-    F_MIN,
-    Stages,
-    corridor,
-    library_route,
-    same_shape,
-    tensors,
-    zoo,
-)
-from fgtutor.feasibility import feasibility_labels
+from fgtutor.course.stages import F_MIN, corridor, library_route, tensors, zoo
+from fgtutor.course.substitutes import Stages, same_shape
 from fgtutor.figures.charts import calibration_plot, draw_curves, draw_table
 from fgtutor.figures.style import TITLE, Picture
-from fgtutor.io.machine import one_thread
-from fgtutor.robots import env_class
 from fgtutor.robots.a1.model import A1Config, build_spec
-from fgtutor.robots.crossings import EnvConfig
 from fgtutor.statistics import calibration, spl, wilson_interval
-from fgtutor.world.terrain import World, make_terrain
+from fgtutor.world.terrain import make_terrain
 
 END = 40
 """Last steps of a drive that are not drawn: their advantage is that of an end, not of a step."""
-ROBOTS, SECONDS = 24, 12.0
-"""Robots of a rollout, and how long each drives, s."""
-HIDDEN, LATENT = 64, 8
-"""Sizes of the net that is trained on a rollout."""
-UPDATES = 80
-"""Updates by the joint loss, before the head alone is trained on."""
-GOAL, MOST = 0.05, 100
-"""Calibration error that its training aims at, and updates that it may take."""
-
-
-@cache
-def rollout(seed: int) -> dict[str, Tensor]:
-    """Return what robots that only roll met on steps of all heights, [time, robots, numbers]."""
-    tiles = [
-        make_terrain("steps", difficulty=(i % 5 + 1) / 5, seed=2 * i + seed) for i in range(20)
-    ]
-    config = EnvConfig(speed=(0.3, 1.5))
-    env = env_class("toy")(World([tiles]), ROBOTS, seed=seed, config=config)
-    return collect(env, lambda seen: torch.zeros(len(seen), 4), SECONDS)
 
 
 @cache
@@ -81,38 +50,10 @@ def draw_labels(own: Stages) -> Figure:
     )
 
 
-@one_thread()
 def draw_calibration(own: Stages) -> Figure:
     """Train a Feasibility-Net on a rollout; draw what it says of another one against what came."""
-    patch, command, label = samples(own, rollout(0))
-    held_patch, held_command, held_label = samples(own, rollout(1))
-
-    def built(make: Any) -> nn.Module:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            net = make(patch.shape[1], command.shape[1], HIDDEN, LATENT)
-        with torch.no_grad():
-            same_shape(net.feasibility(patch, command), label)
-            same_shape(net.reconstruction(patch), label)
-        return net
-
-    net = own.run("FeasibilityNet", lambda: built(nets.build_net), built)
-    net, losses = own.run(
-        "joint_loss",
-        lambda: fitted(nets.joint_loss, net, patch, command, label),
-        lambda f: fitted(f, net, patch, command, label),
-    )
-
-    def trained(function: Any) -> tuple[nn.Module, int]:
-        head = Head(copy.deepcopy(net))
-        both = [torch.cat(pair, dim=-1) for pair in ((patch, command), (held_patch, held_command))]
-        updates, _ = function(head, both[0], label, both[1], held_label, GOAL, MOST)
-        return head.net, int(updates)
-
-    net, updates = own.run("train", lambda: trained(nets.train), trained)
-    with torch.no_grad():
-        f = net.feasibility(held_patch, held_command).double().numpy()
-    measured = held_label.double().numpy()
+    trained = own_net.train(own)
+    f, measured = trained.f, trained.measured
     ours = calibration(f, measured, 10)
 
     def hers(function: Any) -> tuple[np.ndarray, float]:
@@ -121,56 +62,12 @@ def draw_calibration(own: Stages) -> Figure:
 
     figure = calibration_plot(*own.run("reliability", lambda: ours, hers))
     figure.axes[0].set_title(
-        f"{figure.axes[0].get_title(loc='left')}\nJoint loss {losses[0]:.1f} to "
-        f"{losses[-1]:.2f}; {updates} updates more",
+        f"{figure.axes[0].get_title(loc='left')}\nJoint loss "
+        f"{trained.losses[0]:.1f} to {trained.losses[-1]:.2f}; {trained.updates} updates more",
         **TITLE,
         loc="left",
     )
     return figure
-
-
-class Head(nn.Module):
-    """A Feasibility-Net as `train` expects it: one input, patch and command in a row."""
-
-    def __init__(self, net: Any) -> None:
-        super().__init__()
-        self.net = net
-
-    def forward(self, both: Tensor) -> Tensor:
-        """Return f [n] of patches and commands [n, points + 3]."""
-        return self.net.feasibility(both[:, :-3], both[:, -3:])
-
-
-def samples(own: Stages, seen: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return patches, commands and labels of a rollout, every twelfth that can be trusted."""
-    tracking = seen["tracking"]
-    r_v, failed, ended = tracking[1:].double().numpy().transpose(2, 0, 1)
-    ours = tuple(part[:-1].numpy() for part in feasibility_labels(tracking, WINDOW))
-    label, trusted = own.run(
-        "rollout_labels",
-        lambda: ours,
-        lambda f: [same_shape(part, r_v) for part in f(r_v.copy(), failed > 0, ended > 0, WINDOW)],
-    )
-    chosen = torch.tensor(np.flatnonzero(trusted.ravel())[::12])
-    patch, command = (seen[name][:-1].flatten(0, 1)[chosen] for name in ("patch", "command"))
-    return patch, command, torch.tensor(label.ravel()).float()[chosen]
-
-
-def fitted(
-    loss_of: Any, net: nn.Module, patch: Tensor, command: Tensor, label: Tensor
-) -> tuple[nn.Module, list[float]]:
-    """Return a copy of the net after its updates by a joint loss, and the loss at each (Eq. 2)."""
-    net, losses = copy.deepcopy(net), []
-    optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
-    noise = torch.Generator().manual_seed(0)
-    for _ in range(UPDATES):
-        drawn = torch.randn(len(patch), LATENT, generator=noise)
-        loss = loss_of(net, patch, command, label, drawn, 1.0, 5e-4)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(float(loss.detach()))
-    return net, losses
 
 
 def draw_stance(own: Stages) -> Figure:
@@ -223,7 +120,7 @@ def draw_advantages(own: Stages) -> Figure:
         lambda: find("ex09.q2").truth(*given),
         lambda f: same_shape(f(*copy.deepcopy(given)), rewards),
     )
-    r_v, failed, ended = rollout(0)["tracking"][1:].double().numpy().transpose(2, 0, 1)
+    r_v, failed, ended = own_net.rollout(0)["tracking"][1:].double().numpy().transpose(2, 0, 1)
     fell, values = failed > 0, np.full(r_v.shape, r_v.mean() / (1 - gamma))
     table = r_v, values, values.copy(), fell, (ended > 0) & ~fell, gamma, lam
     batch = own.run(
@@ -241,10 +138,15 @@ def draw_advantages(own: Stages) -> Figure:
     upper.legend(loc="lower left", fontsize=9)
     upper.set_title("Where did the toy do better (above 0) than usual?", **TITLE, loc="left")
     image = lower.imshow(
-        batch.T, extent=(0, SECONDS, ROBOTS, 0), aspect="auto", cmap="BrBG", vmin=-3, vmax=3
+        batch.T,
+        extent=(0, own_net.SECONDS, own_net.ROBOTS, 0),
+        aspect="auto",
+        cmap="BrBG",
+        vmin=-3,
+        vmax=3,
     )
     when, who = np.nonzero(fell)
-    lower.plot(SECONDS * (when + 1) / len(r_v), who + 0.5, "kx", markersize=5)
+    lower.plot(own_net.SECONDS * (when + 1) / len(r_v), who + 0.5, "kx", markersize=5)
     lower.set(xlabel="time (s)", ylabel="robot")
     figure.colorbar(image, ax=lower, label="advantage")
     lower.set_title("A rollout, normalised; a cross is a failure", **TITLE, loc="left")

@@ -137,8 +137,9 @@ def build(source: Path, *, fast: bool = False, timeout: int = 900) -> NotebookNo
 def _kept(outputs: Sequence[Any], where: str) -> Iterator[Any]:
     """Yield the outputs worth keeping: text, and pictures as PNGs with their alt text.
 
-    A widget lives only with its kernel and goes, unless it brings a picture of itself; so does a
-    progress bar. Raises `NotebookError` for any other line on stderr: a lesson has no warnings.
+    A widget lives only with its kernel and goes, unless it brings a picture of itself, or words
+    with metadata that say so (`ask.ALONE`); so does a progress bar. Raises `NotebookError` for any
+    other line on stderr: a lesson has no warnings.
     """
     for output in outputs:
         if output.output_type == "stream":
@@ -155,7 +156,7 @@ def _kept(outputs: Sequence[Any], where: str) -> Iterator[Any]:
             output.metadata = {"image/png": {"alt": words}} if words else {}
             yield output
             continue
-        if WIDGET not in data and "text/plain" in data:
+        if "text/plain" in data and (WIDGET not in data or output.metadata.get("text/plain")):
             output.data, output.metadata = {"text/plain": data["text/plain"]}, {}
             yield output
 

@@ -26,9 +26,16 @@ from fgtutor.course.planner_pictures import (
     draw_tensor,
     draw_weights,
 )
-from fgtutor.course.stages import Stages
+from fgtutor.course.substitutes import Stages
 
-TENSORS = ("tensorize", "cut_patch", "reconstruction_loss", "ood_weight", "conformal_weight")
+TENSORS = (
+    "tensorize",
+    "cut_patch",
+    "FeasibilityNet",
+    "reconstruction_loss",
+    "ood_weight",
+    "conformal_weight",
+)
 """From the map to F_i, in the order in which they run."""
 ROUTE = (*TENSORS, "fuse", "edge_costs", "cheapest_route")
 """From the map to the route."""

@@ -20,7 +20,6 @@ from fgtutor.course.patch_pictures import heading_maps, patch_at
 from fgtutor.course.route_pictures import draw_drive
 from fgtutor.course.stages import (
     F_MIN,
-    Stages,
     asked,
     corridor,
     edges,
@@ -30,14 +29,15 @@ from fgtutor.course.stages import (
     planned,
     route_of,
     routed,
-    same_shape,
     tensors,
     weights,
     zoo,
 )
+from fgtutor.course.substitutes import Stages, same_shape
 from fgtutor.directions import NUM_HEADINGS
 from fgtutor.elevation import ElevationMap
 from fgtutor.figures.maps import draw_elevation, draw_route
+from fgtutor.figures.relief import GROUND
 from fgtutor.figures.style import TITLE, Picture
 from fgtutor.routes import Route
 
@@ -77,25 +77,29 @@ def draw_patch(own: Stages) -> Figure:
     )
     after = np.pad(heights, ((0, 1), (0, 0)), constant_values=np.nan)[1:] - heights
     rise = own.run("rise", lambda: after, lambda f: same_shape(f(heights.copy(), 0), after))
-    figure = Picture(7.4, 5.0)
-    above, left, right = figure.subplot_mosaic([["map", "map"], ["patch", "rise"]]).values()
+    figure = Picture(7.4, 4.6)
+    above, right, left = figure.subplot_mosaic([["map", "rise"], ["patch", "patch"]]).values()
     draw_elevation(elevation.crop(0.0, 0.0, 6.0, 4.0), axes=above, bare=True)
+    above.set(xlabel="x (m)", ylabel="y (m)")
     above.scatter(*points.T, s=5, color="black")
     centres = origin + (cells + 0.5) * resolution
     above.scatter(*centres.T, s=3, color="#D55E00")
-    above.set_title("Points of the patch (black), their cells (orange)", **TITLE, loc="left")
+    above.set_title("Points of the patch (black)\nand their cells (orange)", **TITLE, loc="left")
     shape = grid.shape
     extent = (-grid.behind, grid.ahead, -grid.half_width, grid.half_width)
-    image = left.imshow(patch.reshape(shape).T, origin="lower", extent=extent, cmap="cividis")
-    figure.colorbar(image, ax=left, orientation="horizontal", label="height (m)")
+    tall = float(np.nanmax(np.abs(patch)))
+    image = left.imshow(
+        patch.reshape(shape).T, origin="lower", extent=extent, cmap=GROUND, vmin=-tall, vmax=tall
+    )
+    figure.colorbar(image, ax=left, label="height (m)", shrink=0.8)
     left.set_title("The patch", **TITLE, loc="left")
     left.set(xlabel="ahead (m)", ylabel="left (m)")
     reach = float(np.nanmax(np.abs(rise[:60])))
     image = right.imshow(
         rise[:60].T, origin="lower", extent=(0, 6, 0, 4), cmap="BrBG_r", vmin=-reach, vmax=reach
     )
-    figure.colorbar(image, ax=right, orientation="horizontal", label="rise (m)")
-    right.set_title("Up or down along heading 0 (+x)", **TITLE, loc="left")
+    figure.colorbar(image, ax=right, label="rise (m)", shrink=0.6)
+    right.set_title("Up or down\nalong heading 0 (+x)", **TITLE, loc="left")
     right.set(xlabel="x (m)", ylabel="y (m)")
     return figure
 
@@ -259,6 +263,7 @@ def draw_plan(own: Stages) -> Figure:
     )
     figure.colorbar(image, ax=upper, label="F_max")
     upper.set_title("F_max along heading 0 (+x)", **TITLE, loc="left")
+    upper.set_ylabel("y (m)")
     draw_elevation(elevation, axes=lower, bare=True)
     draw_route(route, elevation, axes=lower)
     cost = own.run(

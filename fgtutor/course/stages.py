@@ -1,13 +1,12 @@
 """The stages of the planner, each the learner's function if it has passed, else the library's.
 
-Reads functions by name; runs them on one terrain of the toy, a corridor with all four obstacles
-across it, and gives each stage's answer to the next: patches, f and L_recon, w_ood, F_i, F_max and
-P, and a route, which `crossing` drives. A function that fails on this data is named, and the
-library's runs in its place.
+Reads functions by name (`substitutes`); runs them on one terrain of the toy, a corridor with all
+four obstacles across it, and gives each stage's answer to the next: patches, f and L_recon, w_ood,
+F_i, F_max and P, and a route, which `crossing` drives.
 """
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
 
@@ -16,8 +15,9 @@ import torch
 from jaxtyping import Float, Int
 
 from fgtutor import patches
-from fgtutor.course.grading.replies import TooSlow, explain, time_limit
+from fgtutor.course import own_net
 from fgtutor.course.patch_pictures import patch_at
+from fgtutor.course.substitutes import Stages, same_shape
 from fgtutor.directions import STEPS, Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.feasibility import ALPHA, ood_weight
@@ -28,62 +28,16 @@ from fgtutor.specialist import Specialist, load_zoo
 from fgtutor.tensorization import assess
 from fgtutor.world.terrain import Terrain, make_terrain
 
-SECONDS = 20.0
-"""CPU time that one stage may take with a function of the learner's, s."""
 SEED = 1
 """The corridor that is planned over: its four obstacles can all be crossed."""
 TAUS = 0.1, 2.0
 """The paper's thresholds on L_recon."""
+TRAINED = "steps"
+"""The specialist on whose drives the learner's Feasibility-Net is trained."""
 F_MIN = 0.1
 """Least feasibility of an edge."""
 AHEAD = [1, 7]
 """The diagonal headings that lead towards the goal; the learner's patches are cut along them."""
-
-
-class Stages:
-    """The learner's functions, which of them ran, and what went wrong."""
-
-    def __init__(self, functions: Mapping[str, Callable[..., Any]], faults: Sequence[str]) -> None:
-        self.functions = dict(functions)
-        self.faults = [*faults]
-        self.hers: dict[str, None] = {}
-        self.ours: dict[str, None] = {}
-
-    def run(self, name: str, ours: Callable[[], Any], hers: Callable[[Any], Any]) -> Any:
-        """Return hers(function) if the learner's function has passed and runs here, else ours()."""
-        function = self.functions.get(name)
-        if function is not None:
-            try:
-                with time_limit(SECONDS):
-                    value = hers(function)
-            except TooSlow:
-                self._give_up(name, f"it took more than {SECONDS:g} s")
-            except Exception as error:
-                self._give_up(name, explain(error, ""))
-            else:
-                self.hers[name] = None
-                return value
-        if name not in self.hers:
-            self.ours[name] = None
-        return ours()
-
-    def _give_up(self, name: str, reason: str) -> None:
-        del self.functions[name]  # from here on the library's
-        self.hers.pop(name, None)
-        self.faults.append(f"Your `{name}` fails on the real data, so the library's runs: {reason}")
-
-    def report(self) -> str:
-        """Say whose each stage was, and what went wrong."""
-        yours, ours = (", ".join(names) or "nothing yet" for names in (self.hers, self.ours))
-        return "\n".join([f"Yours: {yours}.", f"The library's: {ours}.", *self.faults])
-
-
-def same_shape(value: Any, like: Any) -> np.ndarray:
-    """Return an answer as an array; raises `ValueError` if its shape is not the library's."""
-    array = np.asarray(value, dtype=float)
-    if array.shape != np.shape(like):
-        raise ValueError(f"it gives an array of shape {array.shape} instead of {np.shape(like)}")
-    return array
 
 
 # What the planner runs on -------------------------------------------------------------------------
@@ -189,13 +143,19 @@ def diagonals_of(function: Callable[..., Any], surface: ElevationMap) -> np.ndar
 
 
 def asked(own: Stages) -> dict[str, tuple[Float[np.ndarray, "nx ny 8"], ...]]:
-    """Return f and L_recon of every cell and heading, by each specialist's networks."""
+    """Return f and L_recon of every cell and heading, by each specialist's networks.
+
+    For the specialist `TRAINED`, f comes from the learner's own net, if hers has passed.
+    """
     patch, found = torch.tensor(seen(own)), {}
     for name, specialist in zoo().items():
         net: Any = specialist.feasibility
         with torch.no_grad():
             command = torch.tensor(specialist.command).expand(*patch.shape[:-1], -1)
             f = net.feasibility(patch, command).double().numpy()
+        if name == TRAINED:
+            f = own_net.feasibility(own, name, patch, command, f)
+        with torch.no_grad():
             relief = net.relief(patch)
             decoded = net.decoder(net.encoder(relief).chunk(2, dim=-1)[0])
             ours = (decoded - relief).square().sum(dim=-1).double().numpy()

@@ -27,9 +27,9 @@ from fgtutor.feasibility import (
     Saturation,
     feasibility_labels,
 )
-from fgtutor.io.validation import Count, CountOrZero, Seed, Width, check_fields
+from fgtutor.io.validation import Count, CountOrZero, Seed, Share, Width, check_fields
 from fgtutor.learning.config import training_tile
-from fgtutor.learning.refit import EASIEST, refitted
+from fgtutor.learning.refit import refitted
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.specialist import GENERAL, Specialist, load_specialist, save_specialist
 from fgtutor.world.terrain import Terrain, World
@@ -63,6 +63,9 @@ class CalibrateConfig:
     """Units of height per metre of the new autoencoder."""
     saturation: Saturation | None = None
     """Difference of heights beyond which it hardly tells more from less, m; None: there is none."""
+    easiest: Share = 0.85
+    """Difficulty of the easiest terrain that it is fitted to: on easy ground, every specialist is
+    at home. Less makes more ground familiar."""
     worlds: Count = 4
     """Training worlds that the patches for the new one come from."""
     envs: Annotated[int, Interval(ge=1, le=10_000)] = 100
@@ -187,7 +190,7 @@ def met_in_training(specialist: Specialist, config: CalibrateConfig) -> Rollout:
     met = []
     for world in range(config.worlds):
         first = 2 * (2**39 + 1000 * (config.seed * config.worlds + world))
-        tiles = own_terrain(specialist, config.envs, first, easiest=EASIEST)
+        tiles = own_terrain(specialist, config.envs, first, easiest=config.easiest)
         met.append(
             roll_out(specialist, tiles, config.envs, config.seconds, seed=world + 1, noise=True)
         )

@@ -26,9 +26,6 @@ from fgtutor.world.terrain import make_terrain
 if TYPE_CHECKING:
     from fgtutor.learning.calibrate import CalibrateConfig, Rollout
 
-EASIEST = 0.85
-"""Difficulty of the easiest terrain that a Feasibility-Net is fitted to: easy ground is not what a
-specialist is for, and ground that all of them know."""
 GROUNDS = 150
 """Maps that a smaller head is fitted to, besides what the policy met."""
 POSES = 1200
@@ -52,7 +49,7 @@ def refitted(specialist: Specialist, met: "Rollout", config: "CalibrateConfig") 
             saturation=config.saturation,
         )
     if config.hidden:
-        fit_head(net, specialist, met, config.updates // 4, seed=config.seed)
+        fit_head(net, specialist, met, config.updates // 4, config.easiest, seed=config.seed)
     else:
         net.head.load_state_dict(old.head.state_dict())
         with torch.no_grad():  # the head reads heights in the new units
@@ -80,13 +77,19 @@ def fit_autoencoder(
 
 
 def fit_head(
-    net: FeasibilityNet, specialist: Specialist, met: "Rollout", updates: int, *, seed: int = 0
+    net: FeasibilityNet,
+    specialist: Specialist,
+    met: "Rollout",
+    updates: int,
+    easiest: float,
+    *,
+    seed: int = 0,
 ) -> None:
     """Fit the head of a net to what a specialist's says of patches met and of any ground.
 
     Planning asks about any ground, so the two must agree also where the policy never was.
     """
-    anywhere = any_ground(specialist, seed)
+    anywhere = any_ground(specialist, easiest, seed)
     command = torch.tensor(specialist.command, dtype=torch.float32).expand(len(anywhere), -1)
     both = [(met.patch, met.command), (anywhere, command)]
     with torch.no_grad():
@@ -102,8 +105,11 @@ def fit_head(
     _fit(net, net.head.parameters(), updates, loss, "fitting f", seed)
 
 
-def any_ground(specialist: Specialist, seed: int = 0) -> Float[Tensor, "n points"]:
-    """Return patches of whatever a map may hold: obstacles of every kind, and natural ground."""
+def any_ground(specialist: Specialist, easiest: float, seed: int = 0) -> Float[Tensor, "n points"]:
+    """Return patches of whatever a map may hold: obstacles of every kind, and natural ground.
+
+    Difficulties of the obstacles are drawn between `easiest` and 1.
+    """
     rng = np.random.default_rng(seed)
     kinds = ("mixed", *ROBOTS[specialist.robot].scale.mixed, "rubble", "slopes")
     cut = []
@@ -111,7 +117,7 @@ def any_ground(specialist: Specialist, seed: int = 0) -> Float[Tensor, "n points
         elevation = make_terrain(
             kinds[i % len(kinds)],
             robot=specialist.robot,
-            difficulty=float(rng.uniform(EASIEST, 1.0)),
+            difficulty=float(rng.uniform(easiest, 1.0)),
             seed=2 * (2**38 + 1000 * seed + i),
         ).elevation
         if i % 3 == 0:

@@ -12,7 +12,7 @@
 # at every place and in every direction, how well it would do there; then plan over the answers.**
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=1)
 

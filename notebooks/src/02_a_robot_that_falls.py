@@ -13,7 +13,7 @@
 # Before you plan with what a robot can do, meet a robot, and let it fail.
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=2)
 
@@ -110,6 +110,7 @@ film_strip(episode, terrain, route, count=4)
 #
 # It is 1 when the velocity $v$ is the commanded $\hat v$. The norm is not squared, so it falls off
 # *steeply*: an error of $\sigma$ leaves $e^{-1} = 0.37$. A larger $\sigma$ would forgive more.
+# Told 0.85 m/s, a robot that is a tenth too slow still earns 0.71, one that stands 0.03.
 
 # %%
 from fgtutor.feasibility import tracking_reward
@@ -335,7 +336,7 @@ reveal(
 # same code, same network, trained longer.
 
 # %%
-from fgtutor import load_zoo
+from fgtutor import load_zoo  # loads the robots: some seconds, once
 
 trials = budget(fast=12, full=40, unit="trials per driver and width", each=0.45)
 shipped = load_zoo("toy")["gaps"]

@@ -14,7 +14,7 @@
 # (paper, Sec. III-A). To train it, one only has to watch the policy drive.
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=3)
 
@@ -373,7 +373,7 @@ print(
 # %%
 import numpy as np
 
-from fgtutor import load_zoo
+from fgtutor import load_zoo  # loads the robots: some seconds, once
 from fgtutor.course.patch_pictures import patch_at
 
 steps = load_zoo("toy")["steps"]

@@ -15,7 +15,7 @@
 # believing it (paper, Sec. III-B, Eqs. 4 and 5).
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=4)
 
@@ -29,7 +29,7 @@ draw_pipeline(here=4)
 # %%
 import numpy as np
 
-from fgtutor import assess, load_zoo, make_terrain
+from fgtutor import assess, load_zoo, make_terrain  # loads the robots: some seconds, once
 
 zoo = load_zoo("toy")
 names = list(zoo)
@@ -73,7 +73,7 @@ from fgtutor.execution import FollowConfig, execute_batch
 patience = FollowConfig(patience=1.5, grace=2.0)
 tiles = list(grounds.values())
 deeds = []
-for name, specialist in zoo.items():
+for name, specialist in zoo.items():  # sixteen drives: some seconds
     routes = [straight_route(tile, name) for tile in tiles]
     deeds.append(execute_batch(routes, tiles, {name: specialist}, seeds=[0] * 4, config=patience))
 
@@ -458,7 +458,7 @@ TauExplorer(M, assessed, START, GOAL)
 #   become? <details><summary>Answer</summary>A step: ground is known or unknown. The planner can no
 #   longer prefer the less strange of two strange routes.</details>
 # - Take away the policy that the route needs most. What does the detour cost?
-#   <details><summary>Answer</summary>Read it below the map: cost and length rise, or the line says
+#   <details><summary>Answer</summary>Read it above the map: cost and length rise, or the line says
 #   why there is no route. The map is made so that there are several ways round.</details>
 # - Think of a measure of strangeness that needs only the training patches. What would it cost on a
 #   map of a million cells?

@@ -13,7 +13,7 @@
 # heading. All these answers together are the **feasibility tensor** (paper, Sec. III-B, Fig. 3).
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=5)
 
@@ -27,7 +27,7 @@ draw_pipeline(here=5)
 # %%
 import numpy as np
 
-from fgtutor import ElevationMap, load_zoo
+from fgtutor import ElevationMap, load_zoo  # loads the robots: some seconds, once
 from fgtutor.figures.maps import draw_elevation
 
 heights = np.zeros((22, 16))
@@ -360,7 +360,7 @@ print(f"paper.py and tensorize differ by {(slow - quick)[inside].abs().max():.1e
 # ## Paint it
 #
 # With a running kernel, paint on the map and watch $F$ and the route follow. A stroke changes only
-# the cells whose window sees it; the line below the map says how many. *Drive* sends the robot.
+# the cells whose window sees it; the line above the map says how many. *Drive* sends the robot.
 
 # %%
 from fgtutor.course.widgets.jupyter import TerrainPainter

@@ -14,7 +14,7 @@
 # is arithmetic and a graph search (paper, Sec. III-C, Fig. 4).
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=6)
 
@@ -28,7 +28,7 @@ draw_pipeline(here=6)
 # a long detour on flat ground.
 
 # %%
-from fgtutor import ElevationMap, load_zoo
+from fgtutor import ElevationMap, load_zoo  # loads the robots: some seconds, once
 from fgtutor.cli.demo import GOAL, MAP, START
 from fgtutor.figures.maps import draw_elevation
 
@@ -489,7 +489,7 @@ compare_routes(corridor.elevation, {"ours": answer, "costmap, raised": refused},
 # %% [markdown]
 # *What to see:* even the raised thresholds close the corridor. A gap is half a metre deep; to a
 # costmap that is a step of half a metre, and raising the threshold so far would open every wall. It
-# is not stupid. Nobody has told it what this robot can do.
+# was never told what this robot can do.
 
 # %% [markdown]
 # ## What you now know

@@ -13,7 +13,7 @@
 # and IV-B).
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=7)
 
@@ -25,7 +25,7 @@ draw_pipeline(here=7)
 # take the next. ([Notation](../docs/notation.md))
 
 # %%
-from fgtutor import load_zoo, make_terrain
+from fgtutor import load_zoo, make_terrain  # loads the robots: some seconds, once
 from fgtutor.planning import plan_on_map
 
 zoo = load_zoo("toy")
@@ -110,7 +110,7 @@ sketch
 # ## When to change the driver: hysteresis
 #
 # The route names a policy for each step: $P$ at its cell and heading (Eq. 7). A robot that stands
-# between two cells could be told to switch to and fro fifty times a second. So a new policy takes
+# between two cells could be told to switch to and fro 25 times per second. So a new policy takes
 # over only once it has been wanted for `hold_steps = 3` control steps in a row.
 
 # %%

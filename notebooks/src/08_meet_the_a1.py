@@ -14,7 +14,7 @@
 # motors, simulated in MuJoCo. The functions that plan and drive are the same.
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=8)
 
@@ -76,7 +76,7 @@ from dataclasses import replace
 
 import torch
 
-from fgtutor import load_zoo, make_terrain
+from fgtutor import load_zoo, make_terrain  # loads the robots: some seconds, once
 from fgtutor.robots.a1.env import A1_EPISODES, A1Env
 from fgtutor.world.terrain import World
 
@@ -165,7 +165,7 @@ seen = env.get_observations()
 print({name: seen[name].shape[1] for name in steps.policy.obs_groups})
 
 # %% [markdown]
-# *Gravity* deserves a look. A policy should not care where north is, but it must know **which way
+# Look at *gravity*. A policy should not care where north is, but it must know **which way
 # is down**. So it observes the direction of gravity *as the trunk sees it*. Put four robots on one
 # slope, looking four ways:
 

@@ -16,7 +16,7 @@
 # IV.
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=9)
 
@@ -30,7 +30,7 @@ draw_pipeline(here=9)
 # curve of its last stage of training. [docs/a1.md](../docs/a1.md) tells of all stages.
 
 # %%
-from fgtutor import load_zoo
+from fgtutor import load_zoo  # loads the robots: some seconds, once
 from fgtutor.figures.charts import training_curve
 
 steps = load_zoo("a1")["steps"]

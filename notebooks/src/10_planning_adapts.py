@@ -13,7 +13,7 @@
 # the experiment of the paper's Sec. IV-A (Fig. 5 and Table I).
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=10)
 
@@ -27,7 +27,7 @@ draw_pipeline(here=10)
 # trained beside it until then.
 
 # %%
-from fgtutor.evaluation.adaptation import AdaptationConfig
+from fgtutor.evaluation.adaptation import AdaptationConfig  # loads the robots: some seconds, once
 
 config = AdaptationConfig(robot="a1")
 stages = config.load_checkpoints()
@@ -110,7 +110,7 @@ predict("Through which gate will the early, the middle and the late stage plan?"
 # %%
 from fgtutor.evaluation.adaptation import find_plans, way_of
 
-plans = find_plans(terrain, stages, config)
+plans = find_plans(terrain, stages, config)  # three nets, a whole map: some seconds
 routes = {name: route for name, (_, route) in plans.items() if route}
 for name, (_, route) in plans.items():
     how = f"{route.length:5.1f} m, the {way_of(route.xy, terrain)} route" if route else "no route"

@@ -14,7 +14,7 @@
 # of the paper's Sec. IV-B (Fig. 6 and Table II).
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=11)
 
@@ -30,7 +30,7 @@ draw_pipeline(here=11)
 # %%
 from dataclasses import replace
 
-from fgtutor import load_zoo, make_terrain
+from fgtutor import load_zoo, make_terrain  # loads the robots: some seconds, once
 from fgtutor.robots import ROBOTS
 
 everyone = load_zoo("a1", include_general=True)

@@ -15,7 +15,7 @@
 # robot.
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=12)
 
@@ -256,7 +256,7 @@ assert spoilt[to_cells.neighbours] < spoilt[0]
 # (Sec. V). Our planner can put a price on it.
 
 # %%
-from fgtutor import load_zoo
+from fgtutor import load_zoo  # loads the robots: some seconds, once
 from fgtutor.baselines import AssessedMap, find_route, ours
 
 zoo = load_zoo("a1")

@@ -14,7 +14,7 @@
 # must not change.
 
 # %%
-from fgtutor.course.diagrams import draw_pipeline
+from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
 
 draw_pipeline(here=13)
 
@@ -31,7 +31,7 @@ draw_pipeline(here=13)
 import shutil
 from pathlib import Path
 
-from fgtutor import load_zoo, make_terrain
+from fgtutor import load_zoo, make_terrain  # loads the robots: some seconds, once
 from fgtutor.specialist import ZOO
 
 team = Path("team")  # a zoo of our own: a folder of folders

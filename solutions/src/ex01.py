@@ -4,7 +4,8 @@
 # **You will be able to** find the cell of a point, cut a patch out of a map, and say in numbers why
 # up a step is not down a step.
 #
-# About 50 minutes. Needs notebook 01, numpy, and no GPU.
+# About 50 minutes. Needs [notebook 01](../notebooks/01_elevation_maps.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run the `check` beneath it: it says at once what
 # holds and what does not. Each call of `hint` gives one more hint. The grader runs this notebook
@@ -139,7 +140,8 @@ check("ex01.q4", rise)
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex01")

@@ -4,7 +4,8 @@
 # **You will be able to** compute the tracking reward, turn a rollout into labels that do not hide a
 # fall, write the two formulas at the heart of PPO, and compute a point of a learning curve.
 #
-# About 50 minutes. Needs notebook 02, numpy, and no GPU.
+# About 50 minutes. Needs [notebook 02](../notebooks/02_a_robot_that_falls.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex02.q1")` gives one more
 # hint at each call, and `solution("ex02.q1")` opens once the check has passed.
@@ -165,7 +166,8 @@ check("ex02.q5", episode_statistics)
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex02")

@@ -4,7 +4,8 @@
 # **You will be able to** build the Feasibility-Net in PyTorch, write its loss, make labels from a
 # rollout, train a net, and test whether what it predicts is true.
 #
-# About 90 minutes. Needs notebook 03, numpy and PyTorch, and no GPU.
+# About 90 minutes. Needs [notebook 03](../notebooks/03_feasibility_net.ipynb),
+# numpy and PyTorch, and no GPU.
 #
 # Write each answer below its question, then run its `check`; `hint("ex03.q1")` gives one more hint
 # at each call, and `solution("ex03.q1")` opens once the check has passed.
@@ -237,7 +238,8 @@ check("ex03.q5", train)
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex03")

@@ -4,7 +4,8 @@
 # **You will be able to** turn a reconstruction loss into a weight, choose its thresholds from data,
 # and say when a place closes.
 #
-# About 25 minutes. Needs notebook 04, numpy, and no GPU.
+# About 25 minutes. Needs [notebook 04](../notebooks/04_have_i_seen_this_before.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex04.q1")` gives one more
 # hint at each call, and `solution("ex04.q1")` opens once the check has passed.
@@ -104,13 +105,15 @@ largest_loss = 0.1 + 1.9 * (1 - 0.1 / 0.9)
 check("ex04.q4", largest_loss)
 
 # %% [markdown]
-# *Why? Two or three sentences, for a teacher to read:*
+# *Why? Two or three sentences. The check marks the number only; your reason is measured by a
+# tutor, or by yourself against the argument in the solution.*
 
 # %% [markdown]
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex04")

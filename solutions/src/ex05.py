@@ -5,7 +5,8 @@
 # first layer as a convolution, turn a tensor together with its headings, reconstruct without
 # decoding, and update a tensor where the map has changed.
 #
-# About 75 minutes. Needs notebook 05, numpy, and no GPU.
+# About 75 minutes. Needs [notebook 05](../notebooks/05_from_map_to_tensor.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex05.q1")` gives one more
 # hint at each call, and `solution("ex05.q1")` opens once the check has passed.
@@ -170,7 +171,8 @@ check("ex05.q5", reassess)
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex05")

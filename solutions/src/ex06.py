@@ -4,7 +4,8 @@
 # **You will be able to** fuse several policies into one tensor, make costs of it, write Dijkstra's
 # search with a heap, check a route's cost by hand, and plan with a price on switching.
 #
-# About 100 minutes. Needs notebook 06, numpy, and no GPU.
+# About 100 minutes. Needs [notebook 06](../notebooks/06_fuse_and_plan.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex06.q1")` gives one more
 # hint at each call, and `solution("ex06.q1")` opens once the check has passed.
@@ -228,13 +229,15 @@ detour_at = 1 / 4
 check("ex06.q7", detour_at)
 
 # %% [markdown]
-# *Why? Two or three sentences, for a teacher to read:*
+# *Why? Two or three sentences. The check marks the number only; your reason is measured by a
+# tutor, or by yourself against the argument in the solution.*
 
 # %% [markdown]
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex06")

@@ -4,7 +4,8 @@
 # **You will be able to** follow a route by pure pursuit, turn towards an aim on the nearer side,
 # and switch policies without flicker.
 #
-# About 50 minutes. Needs notebook 07, numpy, and no GPU.
+# About 50 minutes. Needs [notebook 07](../notebooks/07_drive_the_plan.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex07.q1")` gives one more
 # hint at each call, and `solution("ex07.q1")` opens once the check has passed.
@@ -132,7 +133,8 @@ check("ex07.q4", drive)
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex07")

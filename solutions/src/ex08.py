@@ -4,7 +4,8 @@
 # **You will be able to** turn actions into torques, tell where down is from a quaternion,
 # mirror the robot, and watch a joint swing to its target.
 #
-# About 45 minutes. Needs notebook 08, numpy, and no GPU.
+# About 45 minutes. Needs [notebook 08](../notebooks/08_meet_the_a1.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex08.q1")` gives one more
 # hint at each call, and `solution("ex08.q1")` opens once the check has passed.
@@ -131,7 +132,8 @@ check("ex08.q4", step_response)
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex08")

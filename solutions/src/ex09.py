@@ -4,7 +4,8 @@
 # **You will be able to** move robots through a curriculum, estimate advantages over falls and
 # time-outs, and explain why the learning rate in the log goes up and down.
 #
-# About 45 minutes. Needs notebook 09, numpy, and no GPU.
+# About 45 minutes. Needs [notebook 09](../notebooks/09_train_a_specialist.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex09.q1")` gives one more
 # hint at each call, and `solution("ex09.q1")` opens once the check has passed.
@@ -137,7 +138,8 @@ check("ex09.q4", batch_advantages)
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex09")

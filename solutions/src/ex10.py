@@ -3,7 +3,8 @@
 #
 # **You will be able to** measure a walk, compute SPL, and read a published table backwards.
 #
-# About 20 minutes. Needs notebook 10, numpy, and no GPU.
+# About 20 minutes. Needs [notebook 10](../notebooks/10_planning_adapts.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex10.q1")` gives one more
 # hint at each call, and `solution("ex10.q1")` opens once the check has passed.
@@ -82,13 +83,15 @@ reference_length = (26.75 * 0.19 + 14.84 * 0.34 + 9.73 * 0.51) / 3
 check("ex10.q3", reference_length)
 
 # %% [markdown]
-# *Why? Two or three sentences, for a teacher to read:*
+# *Why? Two or three sentences. The check marks the number only; your reason is measured by a
+# tutor, or by yourself against the argument in the solution.*
 
 # %% [markdown]
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex10")

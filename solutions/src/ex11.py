@@ -4,7 +4,8 @@
 # **You will be able to** put an interval on a success rate, make Table II from raw trials, and test
 # which of two planners is better.
 #
-# About 60 minutes. Needs notebook 11, numpy, and no GPU.
+# About 60 minutes. Needs [notebook 11](../notebooks/11_mixed_terrain.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex11.q1")` gives one more
 # hint at each call, and `solution("ex11.q1")` opens once the check has passed.
@@ -134,7 +135,8 @@ trials_needed = int(np.ceil(99 * 1.96**2))
 check("ex11.q4", trials_needed)
 
 # %% [markdown]
-# *Why? Two or three sentences, for a teacher to read:*
+# *Why? Two or three sentences. The check marks the number only; your reason is measured by a
+# tutor, or by yourself against the argument in the solution.*
 
 # %% [markdown]
 # ## ex11.q5
@@ -177,7 +179,8 @@ check("ex11.q5", table_one)
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex11")

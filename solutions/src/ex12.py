@@ -4,7 +4,8 @@
 # **You will be able to** make a map from a point cloud with stray points, foresee how lost a robot
 # gets, plan with a price on switching, and read Table III.
 #
-# About 50 minutes. Needs notebook 12, numpy, and no GPU.
+# About 50 minutes. Needs [notebook 12](../notebooks/12_from_a_scan_to_a_walk.ipynb),
+# numpy, and no GPU.
 #
 # Write each function below its question, then run its `check`; `hint("ex12.q1")` gives one more
 # hint at each call, and `solution("ex12.q1")` opens once the check has passed.
@@ -130,13 +131,15 @@ all_switches = 0.95 * 1.0 * 1.0 * 0.85 * 1.0
 check("ex12.q4", all_switches)
 
 # %% [markdown]
-# *Why? Two or three sentences, for a teacher to read:*
+# *Why? Two or three sentences. The check marks the number only; your reason is measured by a
+# tutor, or by yourself against the argument in the solution.*
 
 # %% [markdown]
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex12")

@@ -276,13 +276,15 @@ maps_needed = math.ceil((1.96 + 0.8416) ** 2 * (0.95 * 0.05 + 0.90 * 0.10) / 0.0
 check("ex13.q5", maps_needed)
 
 # %% [markdown]
-# *Why? Two or three sentences, for a teacher to read:*
+# *Why? Two or three sentences. The check marks the number only; your reason is measured by a
+# tutor, or by yourself against the argument in the solution.*
 
 # %% [markdown]
 # ## Your own planner
 #
 # What has passed is kept in `mine.py`, beside this notebook. Here the planner runs with your
-# functions in place of the library's, and the picture says which stages are yours.
+# functions in place of the library's, and the lines above the picture say which stages are yours.
+# The first run takes some ten seconds or more: it loads torch and the specialists.
 
 # %%
 with_mine("ex13")

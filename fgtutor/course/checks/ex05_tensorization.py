@@ -1,143 +1,17 @@
 """Exercise 05, "From map to tensor": windows, convolution, headings, L_recon (Sec. III-B)."""
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from fgtutor.course.checks.question import Mistake, Question
-
-
-def _map_with_gap(rng: np.random.Generator) -> tuple:
-    heights = rng.normal(0, 1, (int(rng.integers(7, 9)), int(rng.integers(6, 8))))
-    heights[rng.integers(2, 5), rng.integers(2, 4)] = np.nan
-    return heights, 3, 3, rng.normal(0, 0.5, 9)
-
-
-def tensor_answers(
-    target: "Any", heights: "np.ndarray", rows: int, columns: int, weights: "np.ndarray"
-) -> tuple:
-    """Return the learner's tensor, whether four calls were enough, and the windows asked."""
-    import numpy as np
-
-    calls = []
-
-    def ask(windows: np.ndarray) -> np.ndarray:
-        windows = np.asarray(windows)
-        if windows.ndim != 2 or windows.shape[1] != len(weights):
-            raise ValueError(f"ask takes windows [n, {len(weights)}], got {windows.shape}")
-        calls.append(len(windows))
-        return 1 / (1 + np.exp(-(windows @ weights)))
-
-    tensor = target(heights, rows, columns, ask)
-    return tensor, len(calls) <= 4, sum(calls)
-
-
-def _tensorize(
-    heights: np.ndarray,
-    rows: int,
-    columns: int,
-    ask: Callable[[np.ndarray], np.ndarray],
-    *,
-    single: bool = False,
-    twice: bool = False,
-    unknown: bool = False,
-    relative: bool = True,
-    headings: tuple[int, ...] = (0, 1, 2, 3),
-    mirrored: bool = False,
-    back: int = 0,
-) -> np.ndarray:
-    """Gather each window cell by cell, from where the robot stands; the options make it wrong."""
-    tensor, places, windows = np.zeros((*heights.shape, 4)), [], []
-    for k, heading in enumerate(headings):
-        ahead = np.array(((1, 0), (0, 1), (-1, 0), (0, -1))[heading])
-        left = np.array((-ahead[1], ahead[0])) * (-1 if mirrored else 1)
-        inner = [(i - back, j - columns // 2) for i in range(rows) for j in range(columns)]
-        for cell in np.ndindex(heights.shape):
-            cells = np.array([cell + i * ahead + j * left for i, j in inner])
-            if (cells >= 0).all() and (cells < heights.shape).all():
-                window = heights[cells[:, 0], cells[:, 1]] - (heights[cell] if relative else 0)
-                if unknown or np.isfinite(window).all():
-                    places.append((*cell, k))
-                    windows.append(window)
-    scores = _asked(windows, ask, single)
-    if twice:
-        ask(np.array(windows))
-    tensor[tuple(np.array(places).T)] = np.nan_to_num(scores)
-    return tensor
-
-
-def _asked(windows: list, ask: Callable[[np.ndarray], np.ndarray], single: bool) -> np.ndarray:
-    batches = np.array(windows)[:, None] if single else np.array(windows)[None]
-    return np.concatenate([ask(batch) for batch in batches])
-
-
-def _stroke(rng: np.random.Generator) -> tuple:
-    before = rng.normal(0, 1, (9, 8))
-    before[0, 0] = before[7, 6] = np.nan
-    after = before.copy()
-    x, y = rng.integers(3, 5, 2)
-    after[x : x + 2, y] += 1.0
-    after[x, y - 1] = np.nan  # seen before, unknown now
-    after[7, 6] = 0.0  # unknown before, seen now
-    return before, after, 3, 2, rng.normal(0, 0.5, 6)
-
-
-def update_answers(
-    target: "Any",
-    before: "np.ndarray",
-    after: "np.ndarray",
-    rows: int,
-    columns: int,
-    weights: "np.ndarray",
-) -> tuple:
-    """Return the learner's new answers, the windows asked, the calls, and if the old ones stand."""
-    import numpy as np
-
-    asked = []
-
-    def ask(windows: np.ndarray) -> np.ndarray:
-        asked.append(len(windows))
-        return 1 / (1 + np.exp(-(np.asarray(windows) @ weights)))
-
-    views = np.lib.stride_tricks.sliding_window_view(before, (rows, columns))
-    old = np.nan_to_num(ask(views.reshape(*views.shape[:2], -1)))
-    asked.clear()
-    given = old.copy()
-    new = np.array(target(given, before, after, rows, columns, ask))
-    return new, sum(asked), len(asked), bool((given == old).all())
-
-
-def _reassess(
-    answers: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
-    rows: int,
-    columns: int,
-    ask: Callable[[np.ndarray], np.ndarray],
-    *,
-    everything: bool = False,
-    corner: bool = False,
-    stale: bool = False,
-    shown: np.ndarray | None = None,
-    single: bool = False,
-    in_place: bool = False,
-) -> np.ndarray:
-    """Look at each window in turn; the options make it wrong."""
-    new, places, windows = answers if in_place else answers.copy(), [], []
-    for i, j in np.ndindex(answers.shape):
-        cut = np.s_[i : i + rows, j : j + columns]
-        changed = (before[cut] != after[cut]).ravel()
-        if not (everything or changed[: 1 if corner else None].any()):
-            continue
-        if not np.isnan(after[cut]).any():
-            places.append((i, j))
-            windows.append((after if shown is None else shown)[cut].ravel())
-        elif not stale:
-            new[i, j] = 0.0
-    new[tuple(np.array(places).T)] = _asked(windows, ask, single)
-    return new
+from fgtutor.course.checks.windows import (
+    gathered,
+    map_with_gap,
+    reassessed,
+    stroke,
+    tensor_answers,
+    update_answers,
+)
 
 
 def _layer_inputs(rng: np.random.Generator) -> tuple:
@@ -186,44 +60,44 @@ QUESTIONS = (
         "iy) along heading 0, 90, 180 or 270 degrees, relative to the cell's own height; 0 where "
         "the window leaves the map or holds an unknown cell. Such windows are not asked, every "
         "other one is asked exactly once, in at most four calls.",
-        draw=_map_with_gap,
+        draw=map_with_gap,
         harness=tensor_answers,
-        truth=_tensorize,
+        truth=gathered,
         mistakes=(
             Mistake(
                 "one call per window: collect the windows of a heading, and ask them together.",
-                lambda *given: _tensorize(*given, single=True),
+                lambda *given: gathered(*given, single=True),
             ),
             Mistake(
                 "windows asked twice: each one is asked once; keep the answer.",
-                lambda *given: _tensorize(*given, twice=True),
+                lambda *given: gathered(*given, twice=True),
             ),
             Mistake(
                 "unknown windows asked: leave them out before `ask`; putting 0 into the tensor "
                 "afterwards wastes the work.",
-                lambda *given: _tensorize(*given, unknown=True),
+                lambda *given: gathered(*given, unknown=True),
             ),
             Mistake(
                 "absolute heights: a window is relative to the height of the cell where the robot "
                 "stands.",
-                lambda *given: _tensorize(*given, relative=False),
+                lambda *given: gathered(*given, relative=False),
             ),
             Mistake(
                 "headings that turn clockwise: index 1 is +y, index 3 is -y.",
-                lambda *given: _tensorize(*given)[..., [0, 3, 2, 1]],
+                lambda *given: gathered(*given)[..., [0, 3, 2, 1]],
             ),
             Mistake(
                 "one heading for all: the window turns with the robot.",
-                lambda *given: _tensorize(*given, headings=(0, 0, 0, 0)),
+                lambda *given: gathered(*given, headings=(0, 0, 0, 0)),
             ),
             Mistake(
                 "left and right exchanged: the columns of a window run from the robot's right to "
                 "its left.",
-                lambda *given: _tensorize(*given, mirrored=True),
+                lambda *given: gathered(*given, mirrored=True),
             ),
             Mistake(
                 "a window centred on the robot: its first row is the one that the robot stands in.",
-                lambda *given: _tensorize(*given, back=1),
+                lambda *given: gathered(*given, back=1),
             ),
         ),
         hints=(
@@ -358,37 +232,37 @@ QUESTIONS = (
         expects="the answers for the map `after` the change; only windows that hold a changed cell "
         "and no unknown one are asked, in one call; a window with an unknown cell has 0, and the "
         "array that was given is not changed.",
-        draw=_stroke,
+        draw=stroke,
         harness=update_answers,
-        truth=_reassess,
+        truth=reassessed,
         mistakes=(
             Mistake(
                 "the whole map asked again: only windows that hold a changed cell can have a new "
                 "answer.",
-                lambda *given: _reassess(*given, everything=True),
+                lambda *given: reassessed(*given, everything=True),
             ),
             Mistake(
                 "changed corners alone: a window holds rows x columns cells, and each of them may "
                 "have changed.",
-                lambda *given: _reassess(*given, corner=True),
+                lambda *given: reassessed(*given, corner=True),
             ),
             Mistake(
                 "an old answer where a cell became unknown: its windows are 0 now.",
-                lambda *given: _reassess(*given, stale=True),
+                lambda *given: reassessed(*given, stale=True),
             ),
             Mistake(
                 "windows of the map before: ask about the map `after` the change.",
-                lambda old, before, after, r, c, ask: _reassess(
+                lambda old, before, after, r, c, ask: reassessed(
                     old, before, after, r, c, ask, shown=np.where(np.isnan(before), after, before)
                 ),
             ),
             Mistake(
                 "one call per window: ask all of them together.",
-                lambda *given: _reassess(*given, single=True),
+                lambda *given: reassessed(*given, single=True),
             ),
             Mistake(
                 "the given array changed: it belongs to the caller; work on answers.copy().",
-                lambda *given: _reassess(*given, in_place=True),
+                lambda *given: reassessed(*given, in_place=True),
             ),
         ),
         hints=(

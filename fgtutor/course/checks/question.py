@@ -104,6 +104,11 @@ class Question:
     """Most cases that are drawn, where each takes long; 0 for as many as are asked for."""
 
     @property
+    def worth(self) -> str:
+        """What it is worth, in words."""
+        return f"{self.points} point{'s' * (self.points != 1)}"
+
+    @property
     def parameters(self) -> list[str]:
         """The names of a case's arguments."""
         names = [*inspect.signature(self.harness or self.truth).parameters]

@@ -160,6 +160,8 @@ def describe(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape}"
     if isinstance(value, tuple | list):
+        if 0 < len(value) <= 4 and all(_is_number(item) for item in value):
+            return f"({', '.join(map(_number, value))})"
         inside = ", ".join(describe(item) for item in value[:3]) + ", ..." * (len(value) > 3)
         return f"{len(value)} values ({inside})" if value else "an empty list"
     if isinstance(value, str):
@@ -169,6 +171,10 @@ def describe(value: Any) -> str:
     if isinstance(value, bool | int | float | np.generic):
         return f"the number {_number(value)}"
     return _kind(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float | np.generic) or (isinstance(value, int) and _is_plain(value))
 
 
 def _is_plain(value: Any) -> bool:

@@ -20,6 +20,11 @@ from fgtutor.errors import ConfigError
 NOT_STARTED, CRASHED, TOO_SLOW = "not started", "crashed", "too slow"
 PATIENCE = 10.0
 """Wall time allowed as a multiple of CPU time, for machines that do other work too."""
+SLOW = (
+    "it took more than {:g} s of CPU time: look for a loop that does not end, or for work that is "
+    "done again and again"
+)
+"""What a learner is told whose answer ran out of time."""
 LONGEST = 300
 """Longest message of an error that is passed on, characters."""
 
@@ -94,7 +99,7 @@ def reply_of(
                 name = getattr(getattr(target, "__code__", None), "co_filename", "")
                 return {"outcome": CRASHED, "detail": explain(error, name)}
     except TooSlow:
-        return {"outcome": TOO_SLOW, "detail": f"it took more than {seconds:g} s of CPU time"}
+        return {"outcome": TOO_SLOW, "detail": SLOW.format(seconds)}
 
 
 def _call(target: Callable[..., Any], cases: Sequence[tuple]) -> dict[str, Any]:

@@ -168,7 +168,9 @@ class Drive:
         x, y, _, yaw = self._poses[-1].tolist()
         seconds = (len(self._poses) - 1) * self.env.control_dt
         told = f"({self.speed:.2f} m/s, {self.turn:+.2f} rad/s)"
-        outcome = "fallen: press reset" if self.fallen else f"r_v {self.r_v:.2f}"
+        outcome = f"r_v {self.r_v:.2f}" if seconds else "press play"
+        if self.fallen:
+            outcome = "fallen: press reset"
         return (
             f"{seconds:.1f} s, {self.policy} at x {x:.2f} m, y {y:.2f} m, "
             f"{math.degrees(yaw):.0f} degrees, command {told}: {outcome}"

@@ -42,7 +42,8 @@ def draw_pose(elevation: ElevationMap, grid: PatchGrid, x: float, y: float, yaw:
     """Draw a pose (x and y in m, yaw in degrees) on the map, and beside it the patch seen there."""
     turn = math.radians(yaw)
     heights = patch_at(elevation, (x, y, turn), grid).numpy()
-    picture, (left, right) = sheet(3.4, columns=2, widths=(1.5, 1))
+    tall = map_height(elevation, TALLEST, 0.6 * (WIDTH - 0.75) - 0.35)
+    picture, (left, right) = sheet(max(tall, 2.9), columns=2, widths=(1.5, 1))
     show_map(left, elevation)
     half = grid.spacing / 2
     (x0, y0), (x1, y1) = (end.tolist() for end in (grid.points.amin(0), grid.points.amax(0)))
@@ -55,7 +56,7 @@ def draw_pose(elevation: ElevationMap, grid: PatchGrid, x: float, y: float, yaw:
     left.annotate("", (x + 0.8 * x1 * cos, y + 0.8 * x1 * sin), (x, y), arrowprops={
         "arrowstyle": "->", "color": LINES[1], "linewidth": 2})  # fmt: skip
     name_panel(left, f"({x:.2f}, {y:.2f}) m, yaw {yaw:.0f}°", "x (m)", "y (m)")
-    reach = max(0.1, float(np.abs(heights).max()))
+    reach = max(0.1, float(np.ptp(elevation.heights[elevation.known], axis=None)))
     right.imshow(
         heights.reshape(grid.shape).T,
         cmap=GROUND,

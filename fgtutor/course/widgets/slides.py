@@ -4,6 +4,7 @@ Reads what a notebook has at hand; gives widgets. A slide is a pure function fro
 values to a picture (`slide_curves`, `slide_maps`) and a control for each of its arguments.
 """
 
+import html
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -54,7 +55,7 @@ class Slides(Pictured):
     def __init__(self, draw: Callable[..., Picture], **controls: w.ValueWidget) -> None:
         self.draw, self.controls = draw, controls
         self.image = w.Image(format="png", layout=AS_DRAWN)
-        self.status = w.Label()
+        self.status = w.HTML()  # a label would cut a long line off
         for control in controls.values():
             control.observe(self._show, "value")
         super().__init__([*controls.values(), self.image, self.status])
@@ -73,11 +74,10 @@ class Slides(Pictured):
         try:
             picture = self.still()
         except FgtutorError as error:
-            self.status.value = str(error)
+            self.status.value = html.escape(str(error), quote=False)
             return
-        with self.image.hold_sync():
-            self.image.value = png(picture)
-        self.status.value = picture.alt
+        self.image.value = png(picture)
+        self.status.value = html.escape(picture.alt, quote=False)
 
 
 class PatchSlides(Slides):

@@ -109,7 +109,7 @@ class TauPictures:
             extent=explorer.elevation.extent,
             charts=[
                 Chart(
-                    title=f"L_recon of {name} on this map",
+                    title=f"L_recon of {name}",
                     colour=self.colours[name] if name in explorer.policies else "#999999",
                     span=self._span,
                     shares=shares,

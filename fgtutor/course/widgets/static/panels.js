@@ -165,11 +165,12 @@ function drawPanel(canvas, picture, shape, overlay) {
 
 function render({ model, el }) {
   el.classList.add("fgtutor-scene");
+  // Above the pictures: below them it would lie under the edge of most windows.
+  const status = make("div", "fgtutor-status", el);
+  status.setAttribute("role", "status"); // read aloud when it changes
   const grid = make("div", "fgtutor-rows", el);
   const charts = make("div", "fgtutor-row", el);
   const legend = make("div", "fgtutor-legend", el);
-  const status = make("div", "fgtutor-status", el);
-  status.setAttribute("role", "status"); // read aloud when it changes
   const reading = make("pre", "fgtutor-reading", el);
   let canvases = new Map();
   let laidOut = "";

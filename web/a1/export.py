@@ -1,0 +1,281 @@
+"""Write what the A1 page needs: the robot, its specialists, and grounds with routes over them.
+
+Gives, in a folder: `robot.json` (MuJoCo's model without ground, how the robot is drawn, and the
+numbers of its environment), `specialists/NAME/`, `vendor/` (what comes from npm), and
+`grounds.json` with a `grounds/NN.json.gz` each: what the simulator stands on, what is seen of it,
+what is drawn, the route that Python planned over it, and how Python's robot fared. The grounds are
+those on which evaluation measures mixed terrain (`success.make_ground`), undisturbed.
+"""
+
+# MuJoCo's compiled modules carry no type information that pyright could read.
+# pyright: reportAttributeAccessIssue=false
+
+import base64
+import gzip
+import json
+import shutil
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from fgtutor.baselines import ours
+from fgtutor.evaluation.success import TrialsConfig, make_ground
+from fgtutor.evaluation.trials import Planned, plan_all
+from fgtutor.execution import Episode, FollowConfig, execute_batch
+from fgtutor.figures.style import policy_colours
+from fgtutor.patches import prepare
+from fgtutor.robots import condition_of
+from fgtutor.robots.a1.env import A1_EPISODES, DROP, FREE_FALL, MAX_TILT, RIM
+from fgtutor.robots.a1.ground import rims
+from fgtutor.robots.a1.looks import a1_scene
+from fgtutor.robots.a1.model import FOOT_RADIUS, STANCE, STANCE_HEIGHT, A1Config, build_spec
+from fgtutor.robots.a1.observation import NOISE, SCAN_GRID, SCAN_LIMIT, SCAN_SCALE
+from fgtutor.robots.a1.randomise import UNDISTURBED
+from fgtutor.robots.offscreen import COAT
+from fgtutor.specialist import DESCRIPTION, TENSORS, ZOO, Specialist, load_zoo
+from fgtutor.world.boxes import Box
+from fgtutor.world.terrain import World
+
+PACKAGES = Path(__file__).parents[1] / "node_modules"
+"""Where npm put the packages of web/package.json."""
+VENDOR = (
+    "@mujoco/mujoco/mujoco.js",
+    "@mujoco/mujoco/mujoco.wasm",
+    "three/build/three.module.min.js",
+    "three/build/three.core.min.js",
+)
+"""What the page needs of them; WebAssembly is compressed."""
+CONFIG = TrialsConfig(robot="a1")
+"""How evaluation draws grounds and plans over them, by default."""
+GROUNDS = 20
+"""How many grounds the page offers: evaluation's first."""
+SENSORS = ("foot_position", "trunk_contact")
+"""What of `model.SENSORS` the page reads: it tells a fall by them."""
+LENGTHS = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}
+"""How many numbers of a shape's size count."""
+
+
+def export(folder: Path, count: int = GROUNDS) -> None:
+    """Write everything into `folder`, with the first `count` grounds."""
+    zoo = load_zoo("a1", include_general=True)
+    (folder / "grounds").mkdir(parents=True, exist_ok=True)
+    for name in zoo:
+        copy_specialist(ZOO / "a1" / name, folder / "specialists" / name)
+    plans = plan_grounds(zoo, count)
+    episodes = drive(plans, zoo)
+    entries = []
+    for index, (plan, episode) in enumerate(zip(plans, episodes, strict=True)):
+        file = f"grounds/{index:02d}.json.gz"
+        ground = describe_ground(plan, episode)
+        (folder / file).write_bytes(gzip.compress(_json(ground), mtime=0))
+        entries.append({"seed": plan.ground.terrain.seed, "file": file})
+        if not index:
+            scene = scene_of(plan)
+            (folder / "robot.json").write_bytes(_json(describe_robot(scene, zoo)))
+    (folder / "grounds.json").write_bytes(_json({"grounds": entries}))
+    copy_packages(folder / "vendor")
+
+
+def copy_packages(folder: Path) -> None:
+    """Copy simulator and 3-D library; raises `FileNotFoundError` if npm has not installed them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in VENDOR:
+        source = PACKAGES / name
+        if not source.is_file():
+            raise FileNotFoundError(f"{source} is missing: run `npm install` in {PACKAGES.parent}")
+        if source.suffix == ".wasm":
+            packed = gzip.compress(source.read_bytes(), mtime=0)
+            (folder / f"{source.name}.gz").write_bytes(packed)
+        else:
+            shutil.copyfile(source, folder / source.name)
+
+
+def copy_specialist(source: Path, folder: Path) -> None:
+    """Copy a specialist as it is but for its provenance, which is longer than all the rest."""
+    folder.mkdir(parents=True, exist_ok=True)
+    description = json.loads((source / DESCRIPTION).read_bytes())
+    description.pop("provenance")
+    (folder / DESCRIPTION).write_bytes(_json(description))
+    for file in TENSORS:
+        shutil.copyfile(source / file, folder / file)
+
+
+def plan_grounds(zoo: Mapping[str, Specialist], count: int) -> list[Planned]:
+    """Plan over the first `count` grounds of mixed terrain, as evaluation does."""
+    grounds = [make_ground(CONFIG, "mixed", index) for index in range(count)]
+    settings = CONFIG.planning
+    return plan_all(ours, grounds, (one.assess(zoo, settings) for one in grounds), settings)
+
+
+def drive(plans: Sequence[Planned], zoo: Mapping[str, Specialist]) -> list[Episode]:
+    """Drive the routes in Python's MuJoCo, without noise, from the very start of the route."""
+    routes = [plan.answer.raise_for() for plan in plans]
+    terrains = [plan.ground.terrain for plan in plans]
+    follow = FollowConfig(hold_steps=CONFIG.planning.hold_steps)
+    seeds = [plan.ground.seeds[0] for plan in plans]
+    condition = condition_of("a1", "undisturbed")
+    return execute_batch(routes, terrains, zoo, seeds=seeds, config=follow, condition=condition)
+
+
+def describe_ground(plan: Planned, episode: Episode) -> dict[str, Any]:
+    """Return one ground, its route and what became of Python's robot, as plain values.
+
+    The simulator's boxes are in the frame of `World`, whose corner of the terrain is `corner`;
+    all else is in the terrain's own frame.
+    """
+    terrain, route = plan.ground.terrain, plan.answer.raise_for()
+    world = World([[terrain]])
+    seen, rough = prepare(terrain.elevation), np.asarray(terrain.elevation.filled().heights)
+    follow, seed = FollowConfig(), plan.ground.seeds[0]
+    noise = np.random.default_rng(seed).standard_normal(3)
+    return {
+        "seed": terrain.seed,
+        "size": list(terrain.elevation.size),
+        "sections": [[part.name, part.x0, part.x1] for part in terrain.sections],
+        "corner": world.offset[0, 0].tolist(),
+        "map": {
+            "nx": seen.shape[0],
+            "ny": seen.shape[1],
+            "resolution": seen.resolution,
+            "origin": list(seen.origin),
+            "heights": _floats(seen.heights),
+            "rims": _floats(rims(rough, round(RIM / seen.resolution))),
+        },
+        "boxes": [describe_box(box) for box in world.boxes],
+        "scene": [shape for shape in describe_shapes(scene_of(plan)) if not shape["body"]],
+        "route": {
+            "xy": np.round(route.xy, 6).tolist(),
+            "policies": route.policies.tolist(),
+            "names": list(route.names),
+            "length": route.length,
+        },
+        "goal": list(terrain.goal),
+        "noise": [*(follow.start_noise * noise[:2]), follow.start_yaw_noise * noise[2]],
+        "python": {
+            "outcome": episode.reason,
+            "seconds": round(episode.seconds, 2),
+            "length": round(episode.length, 2),
+        },
+    }
+
+
+def describe_box(box: Box) -> list[float]:
+    """Return centre, half lengths and, where it is tilted, quaternion (w, x, y, z)."""
+    half = [length / 2 for length in box.size]
+    return [*map(float, box.centre), *half, *(box.quaternion if any(box.rpy) else ())]
+
+
+def describe_robot(scene: mujoco.MjModel, zoo: Mapping[str, Specialist]) -> dict[str, Any]:
+    """Return the robot: its model, its looks, and the numbers of its environment."""
+    settings, model = UNDISTURBED, A1Config()
+    return {
+        "xml": robot_xml(model),
+        "shapes": [shape for shape in describe_shapes(scene) if shape["body"]],
+        "mass": float(scene.body_subtreemass[1]),
+        "substeps": settings.substeps,
+        "control_dt": model.timestep * settings.substeps,
+        "action_scale": settings.action_scale,
+        "gait_frequency": settings.gait_frequency,
+        "stance": list(STANCE),
+        "stance_height": STANCE_HEIGHT,
+        "scales": [[count, scale] for count, _, scale in NOISE.values()],
+        "scan": {
+            "grid": {name: getattr(SCAN_GRID, name) for name in ("ahead", "behind", "half_width")},
+            "limit": SCAN_LIMIT,
+            "scale": SCAN_SCALE,
+        },
+        "falls": {
+            "tilt": MAX_TILT,
+            "drop": DROP,
+            "speed": FREE_FALL,
+            "foot_radius": FOOT_RADIUS,
+        },
+        "slowest": A1_EPISODES.slowest,
+        "max_turn_rate": A1_EPISODES.max_turn_rate,
+        "speed": min(specialist.command[0] for specialist in zoo.values()),
+        "policies": [
+            {"name": name, "colour": colour} for name, colour in policy_colours(list(zoo)).items()
+        ],
+    }
+
+
+def robot_xml(model: A1Config) -> str:
+    """Return the robot as XML that MuJoCo 3.14 reads, without ground and with `SENSORS` only.
+
+    MuJoCo 4 writes `input="pos"` for an actuator whose control is a position. 3.14 does not know
+    the word, and needs none: what such an actuator does is in its gain and its biases.
+    """
+    root = ElementTree.fromstring(build_spec(config=model).to_xml())
+    world, actuators, sensors = (_part(root, tag) for tag in ("worldbody", "actuator", "sensor"))
+    for geom in world.findall("geom"):
+        world.remove(geom)
+    for actuator in actuators:
+        actuator.attrib.pop("input", None)
+    for sensor in list(sensors):
+        if not sensor.get("name", "").endswith(SENSORS):
+            sensors.remove(sensor)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def scene_of(plan: Planned) -> mujoco.MjModel:
+    """Return the scene that films of this route show."""
+    route = plan.answer.raise_for()
+    colours = policy_colours(route.names)
+    steps = [_rgb(colours[route.names[policy]]) for policy in route.policies]
+    radius = FollowConfig().goal_radius
+    return a1_scene(plan.ground.terrain, route.xy, steps, width=640, height=480, goal_radius=radius)
+
+
+def describe_shapes(scene: mujoco.MjModel) -> list[dict[str, Any]]:
+    """Return every shape of a scene that is drawn: its body (0: the ground), and how it looks."""
+    shapes = []
+    for i in range(scene.ngeom):
+        if scene.geom_group[i] == 3:  # what collides is not what is drawn
+            continue
+        kind = mujoco.mjtGeom(scene.geom_type[i]).name.removeprefix("mjGEOM_").lower()
+        material = int(scene.geom_matid[i])
+        rgba = scene.geom_rgba[i] if material < 0 else scene.mat_rgba[material]
+        shape = {
+            "body": int(scene.geom_bodyid[i]),
+            "type": kind,
+            "size": _rounded(scene.geom_size[i][: LENGTHS[kind]]),
+            "pos": _rounded(scene.geom_pos[i]),
+            "rgba": [round(float(value), 3) for value in rgba],
+        }
+        if (quat := _rounded(scene.geom_quat[i])) != [1.0, 0.0, 0.0, 0.0]:
+            shape["quat"] = quat
+        if material >= 0 and scene.material(material).name == COAT:
+            shape["coat"] = True
+        shapes.append(shape)
+    return shapes
+
+
+def _part(root: ElementTree.Element, tag: str) -> ElementTree.Element:
+    """Return the part of a model with this tag."""
+    found = root.find(tag)
+    if found is None:
+        raise ValueError(f"MuJoCo wrote no <{tag}>")
+    return found
+
+
+def _rgb(colour: str) -> tuple[float, float, float]:
+    """Return a colour such as "#0072B2" as numbers from 0 to 1."""
+    red, green, blue = (int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    return red, green, blue
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return np.round(np.asarray(values, dtype=float), 5).tolist()
+
+
+def _floats(values: np.ndarray) -> str:
+    """Return numbers as base64 of 32-bit floats, little endian."""
+    return base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode()
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
