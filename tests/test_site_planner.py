@@ -10,20 +10,13 @@ import importlib
 import json
 import shutil
 import sys
-import threading
 from collections.abc import Iterator
-from functools import partial
-from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from test_site_a1 import Quiet, run_node
-from test_site_a1 import node as node  # a fixture
-from test_site_a1 import page as page  # a fixture
-from test_widgets_browser import Page
-from test_widgets_browser import chromium as chromium  # a fixture
+from browser import Page, run_node, serving
 
 from fgtutor import load_zoo, make_terrain
 from fgtutor.elevation import ElevationMap
@@ -212,11 +205,8 @@ def test_ten_maps_are_driven_alike(node, site, zoo, tmp_path, monkeypatch, capsy
 @pytest.fixture(scope="module")
 def address(site) -> Iterator[str]:
     """Serve the site under a prefix."""
-    handler = type("Handler", (Quiet,), {"sent": {}})
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=site.parent)) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}/{site.name}/planner/index.html"
-        server.shutdown()
+    with serving(site.parent) as (address, _):
+        yield f"{address}{site.name}/planner/index.html"
 
 
 def words(page: Page, name: str) -> str:

@@ -1,35 +1,25 @@
 """The widgets where people meet them: a real JupyterLab in a real, headless Chromium.
 
-The browser is driven over its own DevTools protocol, so that nothing needs installing but Chromium
-itself (`make browser`) and the lab extra. Key presses and clicks go through the browser's input
-queue, like a person's. Everything listens on loopback only, JupyterLab behind its token.
+Everything listens on loopback only, JupyterLab behind its token (`browser` has the rest).
 """
 
-import base64
-import itertools
 import json
 import os
 import secrets
-import shutil
 import socket
 import subprocess
 import sys
-import time
-import urllib.error
-import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from browser import end, fetch, until
 
 from fgtutor.course.widgets.explorer import Explorer
 
 ROOT = Path(__file__).parents[1]
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-PATIENCE = 120.0
-"""Longest wait for anything, s: a lab that starts beside other work takes its time."""
 PRESSES = 20
 """Key presses whose latency is taken."""
 WORLD = """
@@ -55,119 +45,6 @@ CELLS = (
     "TauExplorer(M, said, start, goal, taus=(0.1, 2.0), switch_cost=1.0)",
     "from fgtutor.course.widgets.slides import TrackingSlides\nTrackingSlides()",
 )
-
-
-class Page:
-    """One page of a browser, over the Chrome DevTools Protocol."""
-
-    def __init__(self, address: str) -> None:
-        import websocket
-
-        # A browser refuses DevTools to other web pages; a request without an origin is none.
-        self._socket = websocket.create_connection(address, timeout=PATIENCE, suppress_origin=True)
-        self._count = itertools.count(1)
-        self.errors: list[str] = []
-        for domain in ("Runtime", "Log", "Page"):
-            self.call(f"{domain}.enable")
-        # JupyterLab knows no current notebook while its window lacks focus, as a headless one does.
-        self.call("Emulation.setFocusEmulationEnabled", enabled=True)
-
-    def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """Call a method of the protocol and return its result; events on the way are noted."""
-        number = next(self._count)
-        self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
-        while True:
-            message = json.loads(self._socket.recv())
-            if message.get("id") == number:
-                assert "error" not in message, f"{method}: {message['error']}"
-                return message["result"]
-            self._note(message)
-
-    def _note(self, event: dict[str, Any]) -> None:
-        params = event.get("params", {})
-        if event.get("method") == "Runtime.exceptionThrown":
-            details = params["exceptionDetails"]
-            thrown = details.get("exception", {}).get("description", details["text"])
-            self.errors.append(f"uncaught: {thrown}")
-        elif event.get("method") == "Runtime.consoleAPICalled" and params["type"] == "error":
-            words = [str(a.get("value", a.get("description", ""))) for a in params["args"]]
-            self.errors.append("console.error: " + " ".join(words))
-        elif event.get("method") == "Log.entryAdded" and params["entry"]["level"] == "error":
-            entry = params["entry"]
-            self.errors.append(f"{entry['source']}: {entry['text']} {entry.get('url', '')}")
-
-    def evaluate(self, script: str) -> Any:
-        """Run JavaScript in the page, wait for its promise, and return its value."""
-        done = self.call(
-            "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
-        )
-        assert "exceptionDetails" not in done, f"{script}: {done['exceptionDetails']}"
-        return done["result"].get("value")
-
-    def wait(self, script: str, what: str) -> Any:
-        """Wait until a script's value is true, and return it."""
-        deadline = time.monotonic() + PATIENCE
-        while time.monotonic() < deadline:
-            value = self.evaluate(script)
-            if value:
-                return value
-            time.sleep(0.02)
-        raise AssertionError(f"waited {PATIENCE:.0f} s for {what}")
-
-    def press(self, key: str, code: int) -> None:
-        """Press and release a key."""
-        for kind in ("keyDown", "keyUp"):
-            self.call(
-                "Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code
-            )
-
-    def click(self, x: float, y: float) -> None:
-        """Move the mouse to a place in the window and click."""
-        for kind, button in (("mouseMoved", "none"), ("mousePressed", "left"),
-                             ("mouseReleased", "left")):  # fmt: skip
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, clickCount=1)
-
-    def screenshot(self, path: Path) -> None:
-        """Save what the window shows."""
-        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot")["data"]))
-
-    def close(self) -> None:
-        """Hang up."""
-        self._socket.close()
-
-
-def until(ready: Callable[[], Any], what: str, process: subprocess.Popen) -> Any:
-    """Wait for something that a process brings about, and return it."""
-    deadline = time.monotonic() + PATIENCE
-    while time.monotonic() < deadline:
-        assert process.poll() is None, f"{what}: the process ended with code {process.returncode}"
-        value = ready()
-        if value:
-            return value
-        time.sleep(0.1)
-    raise AssertionError(f"waited {PATIENCE:.0f} s for {what}")
-
-
-def fetch(address: str) -> tuple[int, bytes]:
-    """Return status and body of a page on this machine; 0 while nobody answers."""
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    try:
-        with opener.open(address, timeout=PATIENCE) as answer:
-            return answer.status, answer.read()
-    except urllib.error.HTTPError as error:
-        return error.code, b""
-    except (urllib.error.URLError, ConnectionError, TimeoutError):
-        return 0, b""
-
-
-def end(process: subprocess.Popen) -> None:
-    """End a process that this test started, gently first."""
-    process.terminate()
-    try:
-        process.wait(20)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait(20)
 
 
 @pytest.fixture(scope="module")
@@ -212,45 +89,6 @@ def lab(tmp_path_factory) -> Iterator[tuple[str, str]]:
         answered = f"{address}/api/status?token={token}"
         until(lambda: fetch(answered)[0] == 200, f"JupyterLab, see {home / 'log'}", process)
         yield address, token
-    finally:
-        end(process)
-
-
-@pytest.fixture(scope="module")
-def chromium() -> str:
-    """Find the browser, before anything is started."""
-    found = os.getenv("FGTUTOR_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        pytest.skip(
-            "no Chromium on this machine: `make browser` installs it where you are root, or name "
-            "one in FGTUTOR_CHROMIUM"
-        )
-    return found
-
-
-@pytest.fixture
-def page(chromium, tmp_path) -> Iterator[Page]:
-    """Start a headless Chromium with a profile of its own; give its page."""
-    profile = tmp_path / "profile"
-    command = [
-        chromium, "--headless=new", "--remote-debugging-port=0", f"--user-data-dir={profile}",
-        "--window-size=1400,1600", "--no-first-run", "--disable-gpu", "--disable-quic",
-        "--disable-sync", "--disable-component-update", "--disable-background-networking",
-    ]  # fmt: skip
-    if hasattr(os, "geteuid") and os.geteuid() == 0:
-        command.append("--no-sandbox")  # Chromium's sandbox refuses to run as root
-    with (tmp_path / "chromium.log").open("w") as log:
-        process = subprocess.Popen([*command, "about:blank"], stdout=log, stderr=log)
-    try:
-        port_file = profile / "DevToolsActivePort"  # written once the browser listens, on loopback
-        lines = until(
-            lambda: port_file.exists() and port_file.read_text().split(), "Chromium", process
-        )
-        _, listing = fetch(f"http://127.0.0.1:{lines[0]}/json/list")
-        targets = [target for target in json.loads(listing) if target["type"] == "page"]
-        opened = Page(targets[0]["webSocketDebuggerUrl"])
-        yield opened
-        opened.close()
     finally:
         end(process)
 

@@ -83,7 +83,7 @@ def _show_field(question: Prediction) -> bool:
 
     field.observe(take, "value")
     heading = w.HTML(f"<b>Predict first:</b> {html.escape(question.prompt)}")
-    live = w.VBox([heading, field])._repr_mimebundle_()
+    live: Any = w.VBox([heading, field])._repr_mimebundle_()
     data = live[0] if isinstance(live, tuple) else live or {}
     display({**data, "text/plain": question.text}, metadata=ALONE, raw=True)
     return True
