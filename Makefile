@@ -2,7 +2,7 @@
 # touched, but for a browser that `make test` installs where it is root and finds none.
 #   make demo       plan and drive a mixed terrain with the shipped A1 specialists; writes demo/
 #   make test       every test          make test-fast  those that take under a minute together
-#   make lab        JupyterLab on your copy of the first notebook, on this machine only
+#   make lab        JupyterLab on your copy of the course, on this machine only
 #   make notebooks  execute the notebooks' sources in full   make exercises  build them from their masters
 #   make site       the course, the planner and the A1 as web pages, in site/
 #   make test-wheel install wheel and source archive into fresh environments of each Python, and use them
@@ -44,10 +44,10 @@ browser:
 lab: $(ALL)
 	@mkdir -p my/notebooks my/exercises my/docs $(VENV)/share/jupyter/lab/settings
 	@cp notebooks/src/overrides.json $(VENV)/share/jupyter/lab/settings/
-	@for file in notebooks/*.ipynb exercises/*.ipynb docs/*.md; do \
+	@for file in notebooks/*.md notebooks/*.ipynb exercises/*.ipynb docs/*.md; do \
 	  [ -e "my/$$file" ] || cp "$$file" "my/$$file"; done
 	$(BIN)/jupyter lab --ip=127.0.0.1 $(if $(filter 0,$(shell id -u)),--allow-root) \
-	  --LabApp.default_url=/lab/tree/my/notebooks/01_elevation_maps.ipynb
+	  --LabApp.default_url=/lab/tree/my/notebooks/00_start_here.md
 
 notebooks: $(ALL)
 	$(BIN)/fgtutor notebooks

@@ -1,5 +1,6 @@
 """What every test starts from: one thread, no window, and a small specialist made on the spot."""
 
+import gc
 import math
 import os
 from collections.abc import Callable
@@ -30,6 +31,11 @@ from fgtutor.world.terrain import World, make_terrain
 torch.set_num_threads(1)
 settings.register_profile("house", deadline=None, max_examples=25)
 settings.load_profile("house")
+
+
+def pytest_collection_finish() -> None:
+    """Let no garbage collection look at what was imported: trainings collect at each checkpoint."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
 """The fuzzer's specialists, routes, shards, notebooks and checkpoints, and what is right."""
 
 import copy
+import gc
 import hashlib
 import io
 import json
@@ -242,7 +243,9 @@ def trainer() -> Any:
 
     torch.set_num_threads(1)
     tiny: dict[str, Any] = {"num_envs": 2, "steps": 8, "rows": 1, "columns": 1, "hidden": (8, 4)}
-    return Trainer(TrainConfig(out=Path("run"), label_seconds=0.12, iterations=2, **tiny))
+    made = Trainer(TrainConfig(out=Path("run"), label_seconds=0.12, iterations=2, **tiny))
+    gc.freeze()  # a trainer that begins anew collects garbage, and need not look at all of this
+    return made
 
 
 def checkpoints() -> list[Case]:

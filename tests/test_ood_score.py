@@ -150,7 +150,7 @@ def test_a_smaller_head_says_the_same_anywhere(config, monkeypatch):
     config = replace(config, updates=4000, hidden=(24, 12), vae_hidden=(8, 4), latent=2)
     net = refit.refitted(shipped, met_in_training(shipped, config), config)
     assert net.hidden == (24, 12)
-    patch = refit.any_ground(shipped, seed=1)
+    patch = refit.any_ground(shipped, config.easiest, seed=1)
     command = torch.tensor(shipped.command).expand(len(patch), -1)
     with torch.no_grad():
         old = shipped.feasibility.feasibility(patch, command)

@@ -6,7 +6,9 @@ the whole in the same way. The browser has no network: it reaches a server on lo
 
 import html
 import importlib
+import itertools
 import json
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -153,6 +155,16 @@ def test_what_needs_what_is_what_the_readme_says(web):
                              "and 11.")  # fmt: skip
     assert before["09"] == ["02", "03", "08"] and before["11"] == ["06", "07", "08"]
     assert web.pages.direct(before)["11"] == ["08"] and web.pages.direct(before)["12"] == ["11"]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (told,) = re.findall(r"^\*\*Which needs which:\*\* (.*?) \*\*If", readme, re.M | re.S)
+    drawn: dict[str, list[str]] = {}
+    start = (ROOT / "notebooks/00_start_here.md").read_text(encoding="utf-8")
+    for line in start.splitlines():
+        chain = re.sub(r"\[.*?\]", "", line) if "-->" in line else ""  # without the words
+        for old, new in itertools.pairwise(re.findall(r"\d\d", chain)):
+            drawn.setdefault(new, []).append(old)
+    wanted = web.pages.direct(web.pages.needs(told))
+    assert drawn == {name: before for name, before in wanted.items() if before}
     with pytest.raises(ValueError, match="nothing on 13"):
         web.pages.needs("01 to 07 build on each other. 09 needs 02; 10 needs 06; 11 needs 06; "
                         "12 needs 07.")  # fmt: skip

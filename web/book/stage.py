@@ -263,6 +263,9 @@ def first_page(pages: Iterable[str]) -> str:
         raise ValueError(
             "README.md, The course: the book's first page needs its table of notebooks"
         )
+    # Its links count from notebooks/, those of the first page from the root.
+    paths = sections(_read("notebooks/00_start_here.md"))["How much time do you have?"]
+    paths = re.sub(r"\]\((?!\.\./)", "](notebooks/", paths).replace("](../", "](")
     groups = {
         kind: "\n".join(page for page in pages if page.startswith(f"{kind}/"))
         for kind in ("notebooks", "exercises")
@@ -273,6 +276,7 @@ def first_page(pages: Iterable[str]) -> str:
         "reference": "\n".join(reference),
         "map": course_map(needs(which[1])),
         "needs": which[1],
+        "paths": paths,
         "prior": prior[0],
         "syllabus": table[0],
     }
