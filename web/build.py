@@ -161,6 +161,7 @@ def main() -> None:
     shutil.copytree(WEB / "js", out / "js", dirs_exist_ok=True)
     for name in ("index.html", "start.css", "style.css"):
         shutil.copy2(WEB / name, out / name)
+    shutil.copy2(ROOT / "docs/walk.webp", out / "walk.webp")
     faults = check.faults(out)
     for fault in faults:
         print(fault, file=sys.stderr)
