@@ -7,7 +7,7 @@ but this machine.
 # MuJoCo's compiled modules carry no type information that pyright could read.
 # pyright: reportAttributeAccessIssue=false
 
-import importlib.util
+import importlib
 import json
 import math
 import os
@@ -57,11 +57,9 @@ def exporter() -> ModuleType:
     """Return web/a1/export.py, which is no part of the package."""
     if not (WEB / "node_modules").is_dir():
         pytest.skip("the site's npm packages are missing: run `npm install` in web/")
-    spec = importlib.util.spec_from_file_location("a1_export", WEB / "a1" / "export.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(WEB))
+        return importlib.import_module("a1.export")
 
 
 @pytest.fixture(scope="module")

@@ -122,7 +122,8 @@ def _sources_hash(name: str) -> str:
         for path in sorted(folder.rglob(f"*{suffix}")):
             if path.is_file() and path.suffix != ".pyc":
                 digest.update(path.read_bytes())
-    digest.update((WEB / "package.json").read_bytes())
+    for path in (WEB / "exports.py", WEB / "package.json"):
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 

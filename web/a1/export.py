@@ -12,7 +12,6 @@ those on which evaluation measures mixed terrain (`success.make_ground`), undist
 
 import base64
 import gzip
-import json
 import shutil
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
@@ -21,14 +20,15 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from exports import as_json, copy_specialist
+from matplotlib.colors import to_rgb
 
-from fgtutor.baselines import ours
+from fgtutor.baselines import OURS, ours
 from fgtutor.evaluation.success import TrialsConfig, make_ground
-from fgtutor.evaluation.trials import Planned, plan_all
-from fgtutor.execution import Episode, FollowConfig, execute_batch
+from fgtutor.evaluation.trials import Planned, Trial, drive_plans, plan_all
+from fgtutor.execution import FollowConfig
 from fgtutor.figures.style import policy_colours
 from fgtutor.patches import prepare
-from fgtutor.robots import condition_of
 from fgtutor.robots.a1.env import A1_EPISODES, DROP, FREE_FALL, MAX_TILT, RIM
 from fgtutor.robots.a1.ground import rims
 from fgtutor.robots.a1.looks import a1_scene
@@ -36,7 +36,7 @@ from fgtutor.robots.a1.model import FOOT_RADIUS, STANCE, STANCE_HEIGHT, A1Config
 from fgtutor.robots.a1.observation import NOISE, SCAN_GRID, SCAN_LIMIT, SCAN_SCALE
 from fgtutor.robots.a1.randomise import UNDISTURBED
 from fgtutor.robots.offscreen import COAT
-from fgtutor.specialist import DESCRIPTION, TENSORS, ZOO, Specialist, load_zoo
+from fgtutor.specialist import ZOO, Specialist, load_zoo
 from fgtutor.world.boxes import Box
 from fgtutor.world.terrain import World
 
@@ -66,17 +66,16 @@ def export(folder: Path, count: int = GROUNDS) -> None:
     for name in zoo:
         copy_specialist(ZOO / "a1" / name, folder / "specialists" / name)
     plans = plan_grounds(zoo, count)
-    episodes = drive(plans, zoo)
     entries = []
-    for index, (plan, episode) in enumerate(zip(plans, episodes, strict=True)):
-        file = f"grounds/{index:02d}.json.gz"
-        ground = describe_ground(plan, episode)
-        (folder / file).write_bytes(gzip.compress(_json(ground), mtime=0))
+    for index, trial in enumerate(drive(plans, zoo)):
+        plan, file = trial.planned, f"grounds/{index:02d}.json.gz"
+        ground = describe_ground(trial)
+        (folder / file).write_bytes(gzip.compress(as_json(ground), mtime=0))
         entries.append({"seed": plan.ground.terrain.seed, "file": file})
         if not index:
             scene = scene_of(plan)
-            (folder / "robot.json").write_bytes(_json(describe_robot(scene, zoo)))
-    (folder / "grounds.json").write_bytes(_json({"grounds": entries}))
+            (folder / "robot.json").write_bytes(as_json(describe_robot(scene, zoo)))
+    (folder / "grounds.json").write_bytes(as_json({"grounds": entries}))
     copy_packages(folder / "vendor")
 
 
@@ -94,16 +93,6 @@ def copy_packages(folder: Path) -> None:
             shutil.copyfile(source, folder / source.name)
 
 
-def copy_specialist(source: Path, folder: Path) -> None:
-    """Copy a specialist as it is but for its provenance, which is longer than all the rest."""
-    folder.mkdir(parents=True, exist_ok=True)
-    description = json.loads((source / DESCRIPTION).read_bytes())
-    description.pop("provenance")
-    (folder / DESCRIPTION).write_bytes(_json(description))
-    for file in TENSORS:
-        shutil.copyfile(source / file, folder / file)
-
-
 def plan_grounds(zoo: Mapping[str, Specialist], count: int) -> list[Planned]:
     """Plan over the first `count` grounds of mixed terrain, as evaluation does."""
     grounds = [make_ground(CONFIG, "mixed", index) for index in range(count)]
@@ -111,22 +100,19 @@ def plan_grounds(zoo: Mapping[str, Specialist], count: int) -> list[Planned]:
     return plan_all(ours, grounds, (one.assess(zoo, settings) for one in grounds), settings)
 
 
-def drive(plans: Sequence[Planned], zoo: Mapping[str, Specialist]) -> list[Episode]:
-    """Drive the routes in Python's MuJoCo, without noise, from the very start of the route."""
-    routes = [plan.answer.raise_for() for plan in plans]
-    terrains = [plan.ground.terrain for plan in plans]
+def drive(plans: Sequence[Planned], zoo: Mapping[str, Specialist]) -> list[Trial]:
+    """Drive the routes in Python's MuJoCo, undisturbed, as evaluation does."""
     follow = FollowConfig(hold_steps=CONFIG.planning.hold_steps)
-    seeds = [plan.ground.seeds[0] for plan in plans]
-    condition = condition_of("a1", "undisturbed")
-    return execute_batch(routes, terrains, zoo, seeds=seeds, config=follow, condition=condition)
+    return list(drive_plans(OURS, plans, zoo, follow, CONFIG.condition))
 
 
-def describe_ground(plan: Planned, episode: Episode) -> dict[str, Any]:
+def describe_ground(trial: Trial) -> dict[str, Any]:
     """Return one ground, its route and what became of Python's robot, as plain values.
 
     The simulator's boxes are in the frame of `World`, whose corner of the terrain is `corner`;
     all else is in the terrain's own frame.
     """
+    plan, drove = trial.planned, trial.row
     terrain, route = plan.ground.terrain, plan.answer.raise_for()
     world = World([[terrain]])
     seen, rough = prepare(terrain.elevation), np.asarray(terrain.elevation.filled().heights)
@@ -156,9 +142,9 @@ def describe_ground(plan: Planned, episode: Episode) -> dict[str, Any]:
         "goal": list(terrain.goal),
         "noise": [*(follow.start_noise * noise[:2]), follow.start_yaw_noise * noise[2]],
         "python": {
-            "outcome": episode.reason,
-            "seconds": round(episode.seconds, 2),
-            "length": round(episode.length, 2),
+            "outcome": drove["outcome"],
+            "seconds": round(drove["seconds"], 2),
+            "length": round(drove["length"], 2),
         },
     }
 
@@ -225,7 +211,7 @@ def scene_of(plan: Planned) -> mujoco.MjModel:
     """Return the scene that films of this route show."""
     route = plan.answer.raise_for()
     colours = policy_colours(route.names)
-    steps = [_rgb(colours[route.names[policy]]) for policy in route.policies]
+    steps = [to_rgb(colours[route.names[policy]]) for policy in route.policies]
     radius = FollowConfig().goal_radius
     return a1_scene(plan.ground.terrain, route.xy, steps, width=640, height=480, goal_radius=radius)
 
@@ -262,12 +248,6 @@ def _part(root: ElementTree.Element, tag: str) -> ElementTree.Element:
     return found
 
 
-def _rgb(colour: str) -> tuple[float, float, float]:
-    """Return a colour such as "#0072B2" as numbers from 0 to 1."""
-    red, green, blue = (int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
-    return red, green, blue
-
-
 def _rounded(values: np.ndarray) -> list[float]:
     return np.round(np.asarray(values, dtype=float), 5).tolist()
 
@@ -275,7 +255,3 @@ def _rounded(values: np.ndarray) -> list[float]:
 def _floats(values: np.ndarray) -> str:
     """Return numbers as base64 of 32-bit floats, little endian."""
     return base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode()
-
-
-def _json(value: Any) -> bytes:
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()

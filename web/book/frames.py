@@ -11,7 +11,6 @@ import hashlib
 import io
 import itertools
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -133,17 +132,13 @@ def _draw_into(sources: Sequence[str], last: int, expected: str, folder: Path) -
 @contextlib.contextmanager
 def _elsewhere() -> Iterator[None]:
     """Work in an empty folder, as a notebook that is built does, and print nothing."""
-    before = Path.cwd()
     with (
         tempfile.TemporaryDirectory() as folder,
+        contextlib.chdir(folder),
         contextlib.redirect_stdout(io.StringIO()),
         contextlib.redirect_stderr(io.StringIO()),
     ):
-        os.chdir(folder)
-        try:
-            yield
-        finally:
-            os.chdir(before)
+        yield
 
 
 def _frames(controls: Mapping[str, tuple[Control, Sequence[Any]]], draw: Draw, out: Path) -> Frames:

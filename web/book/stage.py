@@ -5,6 +5,7 @@ are, with `conf.py` and a first page beside them. Notebooks keep the outputs the
 with: nothing is executed, but for the frames of sliders (`frames.py`).
 """
 
+import html
 import json
 import posixpath
 import re
@@ -202,8 +203,8 @@ def _live(cell: dict[str, Any], source: str) -> None:
     last = source.strip().splitlines()[-1] if source.strip() else ""
     for begins, (folder, words) in LIVE.items():
         if last.startswith(begins):
-            html = f"<p class='live'>{words.format(f'../../{folder}/index.html')}</p>"
-            cell["outputs"] = [_output(html), *cell["outputs"]]
+            said = f"<p class='live'>{words.format(f'../../{folder}/index.html')}</p>"
+            cell["outputs"] = [_output(said), *cell["outputs"]]
 
 
 def _texts(cell: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -211,8 +212,8 @@ def _texts(cell: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [one for one in cell["outputs"] if "image/png" not in one.get("data", {})]
 
 
-def _output(html: str) -> dict[str, Any]:
-    return {"output_type": "display_data", "data": {"text/html": html}, "metadata": {}}
+def _output(page: str) -> dict[str, Any]:
+    return {"output_type": "display_data", "data": {"text/html": page}, "metadata": {}}
 
 
 def figure(frames: Frames, name: str) -> str:
@@ -227,7 +228,7 @@ def figure(frames: Frames, name: str) -> str:
     at = 0
     for control in frames.controls:
         at = at * len(control.values) + control.start
-    words = frames.alts[at].replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    words = html.escape(frames.alts[at])
     width, height = frames.size
     blob = json.dumps(data, ensure_ascii=False).replace("</", "<\\/")
     return (

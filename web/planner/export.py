@@ -1,22 +1,21 @@
 """Write what the planner's page needs: the toy's specialists, maps, and two WebAssembly files.
 
-Gives, in a folder: `specialists/NAME/` (the zoo's folders as they are), `maps.json` (heights and
+Gives, in a folder: `specialists/NAME/` (see `exports`), `maps.json` (heights and
 where to start and go), `page.json` (names and colours of the policies), `munk.wasm` and
 `nets.wasm` (see `build`). Nothing of it is computed ahead: the page assesses maps and plans itself.
 """
 
-import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from exports import as_json, copy_specialist
 from planner.build import build_wasm
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.figures.style import policy_colours
-from fgtutor.specialist import DESCRIPTION, GENERAL, TENSORS, ZOO, load_zoo
+from fgtutor.specialist import GENERAL, ZOO, load_zoo
 
 SIDE = 64
 """Cells along each side of the maps made here; they are 0.1 m wide."""
@@ -27,19 +26,13 @@ def export(folder: Path) -> None:
     """Write everything into `folder`."""
     names = list(load_zoo("toy", include_general=True))
     for name in names:
-        copied = folder / "specialists" / name
-        copied.mkdir(parents=True, exist_ok=True)
-        for file in TENSORS:
-            shutil.copyfile(ZOO / "toy" / name / file, copied / file)
-        description = json.loads((ZOO / "toy" / name / DESCRIPTION).read_text(encoding="utf-8"))
-        description["provenance"].pop("curve", None)  # the curve of its training is long
-        _write(copied / DESCRIPTION, description)
+        copy_specialist(ZOO / "toy" / name, folder / "specialists" / name)
     colours = policy_colours(names)
     policies = [
         {"name": name, "colour": colours[name], "specialist": name != GENERAL} for name in names
     ]
-    _write(folder / "page.json", {"policies": policies})
-    _write(folder / "maps.json", [plain_map(*one) for one in maps()])
+    (folder / "page.json").write_bytes(as_json({"policies": policies}))
+    (folder / "maps.json").write_bytes(as_json([plain_map(*one) for one in maps()]))
     build_wasm(folder)
 
 
@@ -99,7 +92,3 @@ def plain_map(label: str, elevation: ElevationMap, start: Point, goal: Point) ->
         "start": list(start),
         "goal": list(goal),
     }
-
-
-def _write(path: Path, content: Any) -> None:
-    path.write_text(json.dumps(content, separators=(",", ":")), encoding="utf-8")

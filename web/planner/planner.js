@@ -6,7 +6,7 @@
  */
 
 import { readBytes, readJson } from "../js/files.js";
-import { OURS, PAPER } from "../js/planning.js";
+import { cellOf, centreOf, OURS, PAPER } from "../js/planning.js";
 import { loadSpecialist } from "../js/specialist.js";
 import { prepare } from "../js/tensorization.js";
 import { CELL, drawRoute, drawSide, GROUND_ENDS, paintMap, ramp } from "./draw.js";
@@ -235,9 +235,8 @@ function painting() {
   return !["goal", "start"].includes($("tool").value);
 }
 
-function centre([ix, iy]) {
-  const { origin, resolution } = page.map;
-  return [origin[0] + (ix + 0.5) * resolution, origin[1] + (iy + 0.5) * resolution];
+function centre(cell) {
+  return centreOf(page.map, cell);
 }
 
 /** Choose a map: copy it, so that painting leaves the original alone. */
@@ -317,21 +316,19 @@ function listenToMap() {
       event.key
     ];
     const { map } = page;
-    const cellOf = (point) =>
-      point.map((value, i) => Math.floor((value - map.origin[i]) / map.resolution + 1e-6));
     if (step) {
       const name = painting()
         ? "brush"
         : event.shiftKey || $("tool").value === "start"
           ? "start"
           : "goal";
-      const cell = cellOf(page[name] ?? page.goal).map((value, i) => value + step[i]);
+      const cell = cellOf(map, page[name] ?? page.goal).map((value, i) => value + step[i]);
       if (cell[0] < 0 || cell[1] < 0 || cell[0] >= map.nx || cell[1] >= map.ny) return;
       page[name] = centre(cell);
       draw();
       if (name !== "brush") ask();
     } else if (painting() && (event.key === " " || event.key === "Enter")) {
-      use(cellOf(page.brush ?? page.goal));
+      use(cellOf(map, page.brush ?? page.goal));
     } else return;
     event.preventDefault();
   });
