@@ -80,7 +80,7 @@ def compare_routes(
     check_arguments(compare_routes, locals(), ConfigError)
     rows = -(-len(routes) // columns)
     width = 7.6 / columns
-    figure = Picture(7.6, rows * (width * elevation.size[1] / elevation.size[0] + 0.6) + 0.4)
+    figure = Picture(7.6, rows * (width * elevation.size[1] / elevation.size[0] + 0.8) + 0.4)
     panels = np.ravel(figure.subplots(rows, columns, squeeze=False))
     used: dict[str, str] = {}
     for axes, (caption, route) in zip(panels, routes.items(), strict=False):
@@ -95,8 +95,8 @@ def compare_routes(
             colours = list(policy_colours(route.names).values())
             used |= {route.names[i]: colours[i] for i in np.unique(route.policies).tolist()}
         axes.set_title(caption, **TITLE, loc="left")
-        axes.set_xlabel(words, fontsize=9)
-        axes.set(xticks=(), yticks=())
+        axes.set_xlabel(f"x (m)\n{words}", fontsize=9)
+    panels[0].set_ylabel("y (m)", fontsize=9)
     for axes in panels[len(routes) :]:
         axes.remove()
     legend(panels[0], used)

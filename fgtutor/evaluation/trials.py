@@ -61,9 +61,10 @@ class ZooConfig(RunConfig):
 
     def told(self, condition: Condition) -> str:
         """Say what is amiss and what the policies know of their motion, for a caption."""
-        blind = all(specialist.history for specialist in self.load_zoo().values())
-        told = "its own estimate of its velocity" if blind else condition.told
-        return f"{condition.words}; told {told}"
+        said = f"{condition.words}; told {condition.told}"
+        blind = [name for name, specialist in self.load_zoo().items() if specialist.history]
+        who = f"{', '.join(blind)} estimate" if len(blind) > 1 else "".join(blind) + " estimates"
+        return f"{said}; but {who} the velocity from what they sense" if blind else said
 
     def zoo_digests(self) -> dict[str, str]:
         """Return a digest of each of them, which changes with any of its weights."""

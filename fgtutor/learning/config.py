@@ -22,7 +22,7 @@ from fgtutor.learning.ppo import FeasibilityPPO
 from fgtutor.policies.dreamwaq import HISTORY, LONGER, DreamWaQModel, EstimatingModel
 from fgtutor.policies.symmetry import SymmetricMLPModel
 from fgtutor.robots import ROBOTS, env_class
-from fgtutor.robots.base import LocomotionEnv
+from fgtutor.robots.base import Gait, LocomotionEnv
 from fgtutor.world.obstacles import OBSTACLES
 from fgtutor.world.terrain import Terrain, World, make_terrain
 from fgtutor.world.turned import make_turned
@@ -74,6 +74,9 @@ class TrainConfig:
     disturbances: Literal["usual", "wide"] = "usual"
     """How far robots, sensors and ground differ from one another; wide, of robots that have it, for
     policies that shall hold under disturbance and on other models."""
+    gait: Gait = "trot"
+    """How the feet of a robot with legs take turns: in diagonal pairs, or one after another, which
+    needs less friction."""
     hours: NonNegative = 0.0
     """Stop and save after this many hours; --resume goes on. 0 sets no limit."""
     iterations: Count = 200
@@ -262,18 +265,14 @@ def training_tile(
 def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
     """Build the robots on the world in which training goes on from `iteration`."""
     make = env_class(config.robot)
-    wide, options = config.disturbances != "usual", {}
-    if wide:
-        if config.disturbances not in make.disturbances:
-            raise ConfigError(
-                f"{config.robot} knows no {config.disturbances} disturbances: leave them usual"
-            )
-        options["settings"] = make.disturbances[config.disturbances]
+    options = make.training_options(disturbances=config.disturbances, gait=config.gait)
     return make(
         training_world(config, iteration),
         config.num_envs,
         config=dataclasses.replace(
-            make.episodes, history=FRAMES.get(config.actor, 0), oblique=wide
+            make.episodes,
+            history=FRAMES.get(config.actor, 0),
+            oblique=config.disturbances == "wide",
         ),
         seed=config.seed,
         device=config.device,

@@ -11,8 +11,8 @@ policy that trains on two CPU cores, adds a gait clock and left-right symmetry.
 
 import math
 import warnings
-from dataclasses import asdict, fields
-from typing import Any, ClassVar
+from dataclasses import asdict, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ from fgtutor.robots.a1.observation import NOISE, SCAN_GRID, SCAN_LIMIT, SCAN_SCA
 from fgtutor.robots.a1.physics import Physics
 from fgtutor.robots.a1.randomise import WIDE, A1EnvConfig, Bodies, delayable, randomise
 from fgtutor.robots.a1.sensing import Senses
-from fgtutor.robots.base import Layout, LocomotionEnv
+from fgtutor.robots.base import Gait, Layout, LocomotionEnv
 from fgtutor.robots.crossings import EnvConfig
 from fgtutor.world.terrain import World
 
@@ -81,7 +81,6 @@ class A1Env(LocomotionEnv):
     mirror = observation.mirror()
     episodes = A1_EPISODES
     felt, unfelt = observation.FELT, observation.UNFELT
-    disturbances: ClassVar = {"wide": WIDE}
 
     def __init__(
         self,
@@ -283,6 +282,12 @@ class A1Env(LocomotionEnv):
         """Return the trunk's velocity in its own frame, without noise, scaled as observed."""
         return (self.body_velocity * self.scale[:3]).clamp(-20.0, 20.0)
 
+    @classmethod
+    def training_options(cls, *, disturbances: str, gait: Gait) -> dict[str, Any]:
+        """Return the settings of a training: the usual ranges, or `WIDE` ones, and a gait."""
+        settings = {"usual": A1EnvConfig(), "wide": WIDE}[disturbances]
+        return {"settings": replace(settings, gait=gait)}
+
     def conditions(self) -> dict[str, Any]:
         """Return the settings and the model, as plain values."""
         return {"settings": asdict(self.settings), "model": asdict(self.model)}
@@ -346,7 +351,7 @@ class A1Env(LocomotionEnv):
         force = self._feet("foot_force").norm(dim=-1)
         foot = self._feet("foot_position")
         gait = rewards.gait(
-            rewards.stance_share(self.clock),
+            rewards.stance_share(self.clock, self.settings.gait),
             force,
             self._feet("foot_velocity").norm(dim=-1),
             foot[..., 2] - FOOT_RADIUS - self._lookup(self.edges, foot[..., :2]),

@@ -23,6 +23,7 @@ from fgtutor.robots.a1.model import LEGS, A1Config
 from fgtutor.robots.a1.observation import SCAN_NOISE
 from fgtutor.robots.a1.physics import Physics
 from fgtutor.robots.a1.rewards import RewardWeights
+from fgtutor.robots.base import Gait
 
 Friction = Annotated[float, Interval(gt=0, le=5)]
 """A coefficient of friction."""
@@ -52,6 +53,8 @@ class A1EnvConfig:
     """Simulation steps per control step: 50 Hz control."""
     gait_frequency: Annotated[float, Interval(gt=0, le=20)] = 2.0
     """Gait cycles per second."""
+    gait: Gait = "trot"
+    """How feet shall take turns, by the reward."""
     swing_height: Annotated[tuple[Share, Share], Ascending] = (0.04, 0.1)
     """Lowest and highest clearance of a good swing, m."""
     weights: RewardWeights = field(default_factory=RewardWeights)
@@ -77,10 +80,9 @@ class A1EnvConfig:
     rate_gain: Annotated[tuple[Factor, Factor], Ascending] = (1.0, 1.0)
     """Range of a factor on the joint controllers' damping (D gain) alone."""
     joint_damping: Annotated[tuple[Damping, Damping], Ascending] = (0.0, 0.0)
-    """Range of the passive joint damping added to the model's own, N m s / rad; small values are
-    drawn more often than large ones."""
+    """Range of the passive joint damping added to the model's own, N m s / rad."""
     dry_friction: Annotated[tuple[Damping, Damping], Ascending] = (0.0, 0.0)
-    """Range of the joints' dry friction added to the model's own, N m; small ones more often."""
+    """Range of the joints' dry friction added to the model's own, N m."""
     delay: Annotated[tuple[Delay, Delay], Ascending] = (0.0, 0.0)
     """Range of the time after which a robot's actions take effect, s; whole simulation steps."""
     noise_share: NonNegative = 1.0
@@ -205,10 +207,7 @@ def randomise(physics: Physics, settings: A1EnvConfig, seed: int) -> Bodies:
     stiffness, damping = (draw(1 - s.gain_share, 1 + s.gain_share, 1) for _ in range(2))
     late = draw(0.0, 1.0, 1) < s.delayed_share
     strength, rate_gain, delay = draw(*s.strength, 1), draw(*s.rate_gain, 1), draw(*s.delay, 1)
-    passive, dry = (
-        low + (high - low) * draw(0.0, 1.0, 1).square()
-        for low, high in (s.joint_damping, s.dry_friction)
-    )
+    passive, dry = draw(*s.joint_damping, 1), draw(*s.dry_friction, 1)
     calm = draw(0.0, 1.0, 1) < s.calm_share
     for value in (payload, shift, late, delay, passive, dry):
         value.masked_fill_(calm, 0)
