@@ -41,7 +41,7 @@ SPECIALISTS = (
     "a1/steps",
     "a1/bridge",
     "a1/general",
-    "a1/_robust/steps",
+    "a1/_checkpoints/late",
 )
 """One of each kind: with and without mirror, saturation, other sizes, estimating."""
 GROUNDS = int(os.getenv("FGTUTOR_SITE_GROUNDS", "10"))
