@@ -144,7 +144,8 @@ def record_episode(exporter: ModuleType) -> list[dict[str, Any]]:
     zoo = load_zoo("a1", include_general=True)
     (plan,) = exporter.plan_grounds(zoo, 1)
     route, names = plan.answer.raise_for(), tuple(zoo)
-    config = replace(A1Env.episodes, train=False, stuck_seconds=math.inf)
+    frames = max(specialist.history for specialist in zoo.values())
+    config = replace(A1Env.episodes, train=False, stuck_seconds=math.inf, history=frames)
     options = condition_of("a1", "undisturbed").options
     env = A1Env(World([[plan.ground.terrain]]), 1, config=config, **options)
     places = {i: names.index(name) for i, name in enumerate(route.names)}
@@ -158,13 +159,15 @@ def record_episode(exporter: ModuleType) -> list[dict[str, Any]]:
     act, fallen = drive._act, env.fallen
 
     def watched_act() -> torch.Tensor:
+        seen = env.get_observations()
         state = {
             "qpos": env.physics.qpos[0].tolist(),
             "qvel": env.physics.qvel[0].tolist(),
             "lastAction": env.last_action[0].tolist(),
             "clock": float(env.clock[0]),
             "command": env.command[0].tolist(),
-            "observation": env.get_observations()["policy"][0].tolist(),
+            "observation": seen["policy"][0].tolist(),
+            "history": seen["history"][0].tolist() if frames else [],
             "policy": names[drive.active[0]],
         }
         action = act()

@@ -55,7 +55,8 @@ test("a recorded episode replayed step by step", async () => {
     note("command", differ(command, step.command));
     const observation = env.observe(command);
     note("observation", differ([...observation], step.observation));
-    const action = zoo.get(walk.policy).act(observation);
+    const { act, groups } = zoo.get(walk.policy);
+    const action = act(env.observe(command, groups));
     note("action", differ([...action], step.action));
     env.step(Float32Array.from(step.action));
     assert.equal(env.fallen(), step.fell, `fallen after step ${i}`);

@@ -60,6 +60,8 @@ export class A1Env {
     this.felt = this.scales.length;
     this.lastAction = new Float32Array(this.stance.length);
     this.observation = new Float32Array(this.felt + 3 + this.grid.count);
+    /** The last frames of what a policy feels that is not told its velocity; the newest last. */
+    this.frames = new Float32Array(robot.history * this.felt);
     this.clock = 0;
     this.broken = false;
   }
@@ -84,6 +86,7 @@ export class A1Env {
     data.qpos.set([x + corner[0], y + corner[1], z, ...quat, ...this.stance]);
     data.ctrl.set(this.stance);
     this.lastAction.fill(0);
+    this.frames.fill(0);
     this.clock = 0;
     this.broken = false;
     mujoco.mj_forward(model, data);
@@ -91,10 +94,11 @@ export class A1Env {
   }
 
   /** Take over a state, as recorded elsewhere; for tests. */
-  restore({ qpos, qvel, lastAction, clock }) {
+  restore({ qpos, qvel, lastAction, clock, history }) {
     this.data.qpos.set(qpos);
     this.data.qvel.set(qvel);
     this.lastAction.set(lastAction);
+    this.frames.set(history);
     this.clock = fround(clock);
     this.mujoco.mj_step1(this.model, this.data);
     this.read();
@@ -121,13 +125,14 @@ export class A1Env {
   }
 
   /**
-   * Return what the policies read: what is felt, the command, and the scan. The next call
-   * overwrites it.
+   * Return what a policy reads, group after group: `policy` is what is felt, the command and the
+   * scan, `history` the last frames of felt and command without the velocity, `scan` the scan.
    *
    * @param {ArrayLike<number>} command - (vx, vy, wz)
+   * @param {("policy" | "history" | "scan")[]} groups
    */
-  observe(command) {
-    const { q, v, east, north, up, observation, scales, felt } = this;
+  observe(command, groups = ["policy"]) {
+    const { q, v, east, north, up, observation, frames, scales, felt } = this;
     const angle = 2 * Math.PI * this.clock;
     const velocity = [0, 1, 2].map((i) => v[0] * east[i] + v[1] * north[i] + v[2] * up[i]);
     const parts = [
@@ -145,8 +150,11 @@ export class A1Env {
       observation[i] = min(max(observation[i] * scales[i], -LARGEST), LARGEST);
     }
     observation.set(command, felt);
-    this.scan(observation.subarray(felt + 3));
-    return observation;
+    const scan = observation.subarray(felt + 3);
+    this.scan(scan);
+    frames.set(observation.subarray(3, felt + 3), frames.length && frames.length - felt);
+    const all = { policy: observation, history: frames, scan };
+    return Float32Array.from(groups.flatMap((group) => [...all[group]]));
   }
 
   /** Write heights around the robot relative to its trunk, centred and scaled. */
@@ -167,6 +175,7 @@ export class A1Env {
     this.broken ||= !action.every(Number.isFinite);
     if (this.broken) action = new Float32Array(action.length);
     this.lastAction.set(action);
+    this.frames.copyWithin(0, this.felt);
     const target = stance.map((value, i) => value + fround(robot.action_scale * action[i]));
     data.ctrl.set(target);
     // mj_step in two halves: what depends on positions and velocities is current at the end.

@@ -20,7 +20,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from exports import as_json, copy_specialist
+from exports import as_json, copy_specialist, pack
 from matplotlib.colors import to_rgb
 
 from fgtutor.baselines import OURS, ours
@@ -48,7 +48,7 @@ VENDOR = (
     "three/build/three.module.min.js",
     "three/build/three.core.min.js",
 )
-"""What the page needs of them; WebAssembly is compressed."""
+"""What the page needs of them; WebAssembly and the 3-D library are compressed."""
 CONFIG = TrialsConfig(robot="a1")
 """How evaluation draws grounds and plans over them, by default."""
 GROUNDS = 20
@@ -86,9 +86,8 @@ def copy_packages(folder: Path) -> None:
         source = PACKAGES / name
         if not source.is_file():
             raise FileNotFoundError(f"{source} is missing: run `npm install` in {PACKAGES.parent}")
-        if source.suffix == ".wasm":
-            packed = gzip.compress(source.read_bytes(), mtime=0)
-            (folder / f"{source.name}.gz").write_bytes(packed)
+        if source.suffix == ".wasm" or source.name.startswith("three"):
+            pack(source.read_bytes(), folder / source.name)
         else:
             shutil.copyfile(source, folder / source.name)
 
@@ -182,6 +181,7 @@ def describe_robot(scene: mujoco.MjModel, zoo: Mapping[str, Specialist]) -> dict
         },
         "slowest": A1_EPISODES.slowest,
         "max_turn_rate": A1_EPISODES.max_turn_rate,
+        "history": max(specialist.history for specialist in zoo.values()),
         "speed": min(specialist.command[0] for specialist in zoo.values()),
         "policies": [
             {"name": name, "colour": colour} for name, colour in policy_colours(list(zoo)).items()

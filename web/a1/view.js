@@ -6,7 +6,13 @@
  * the arrow keys, and zoomed by the wheel, by two fingers or by + and -.
  */
 
-import * as THREE from "./vendor/three.module.min.js";
+import { inflateModule } from "../js/files.js";
+
+const vendor = (name) => new URL(`vendor/${name}.gz`, import.meta.url);
+const core = await inflateModule(vendor("three.core.min.js"));
+const THREE = await import(
+  await inflateModule(vendor("three.module.min.js"), { "./three.core.min.js": core })
+);
 
 /** Angle of the arrow keys, rad, and the factor of + and -. */
 const TURN = 0.08;

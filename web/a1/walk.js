@@ -49,8 +49,8 @@ export class Walk {
     const { env, follower } = this;
     const [x, y] = env.place2d;
     const command = follower.command([x, y], env.yaw);
-    const action = this.zoo.get(this.policy).act(env.observe(command));
-    env.step(action);
+    const { act, groups } = this.zoo.get(this.policy);
+    env.step(act(env.observe(command, groups)));
     this.length += Math.hypot(env.place2d[0] - x, env.place2d[1] - y);
     this.outcome = follower.outcome(env.place2d, env.fallen());
   }

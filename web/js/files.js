@@ -24,6 +24,18 @@ export async function readBytes(address) {
   return new Response(answer.body.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
 }
 
+/**
+ * Return an address for a module of JavaScript whose file is compressed.
+ *
+ * @param {string | URL} address
+ * @param {Record<string, string>} imports - What it imports by another address than it says.
+ */
+export async function inflateModule(address, imports = {}) {
+  let text = new TextDecoder().decode(await readBytes(address));
+  for (const [said, meant] of Object.entries(imports)) text = text.replaceAll(said, meant);
+  return URL.createObjectURL(new Blob([text], { type: "text/javascript" }));
+}
+
 /** Return the JSON of a file. */
 export async function readJson(address) {
   return JSON.parse(new TextDecoder().decode(await readBytes(address)));

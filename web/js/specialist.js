@@ -38,10 +38,11 @@ const VELOCITY = 3;
 export async function loadSpecialist(folder, { net = true } = {}) {
   const base = String(folder).replace(/\/?$/, "/");
   const tensors = async (file) => parseSafetensors(await readBytes(base + file));
-  const [description, policy, weights] = await Promise.all([
-    readJson(`${base}specialist.json`),
-    tensors("policy.safetensors"),
-    net ? tensors("feasibility.safetensors") : null,
+  const description = await readJson(`${base}specialist.json`);
+  const { packed = "" } = description;
+  const [policy, weights] = await Promise.all([
+    tensors(`policy.safetensors${packed}`),
+    net ? tensors(`feasibility.safetensors${packed}`) : null,
   ]);
   const { name, robot, command, grid, quantiles, strangeness = {} } = description;
   return {
