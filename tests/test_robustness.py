@@ -88,7 +88,8 @@ def test_a_caption_says_every_range():
     for part in ("friction 0.4 to 1.1", "payload 0 to 2 kg", "delay 0 to 0.03 s", "0.5 m/s"):
         assert part in words
     # A disturbance that training can draw has words: whatever is new must be said, too.
-    silent = {"randomise", "action_scale", "substeps", "gait_frequency", "swing_height", "weights"}
+    reward = {"gait", "gait_frequency", "swing_height", "weights"}
+    silent = {"randomise", "action_scale", "substeps"} | reward
     details = {"push_seconds", "noise_share", "scan_noise"}
     velocity = {"velocity", "velocity_error", "velocity_seconds"}
     assert {f.name for f in fields(A1EnvConfig)} == silent | details | velocity | PHRASES.keys()
@@ -100,6 +101,15 @@ def test_what_the_policy_is_told_of_its_velocity_is_said():
     assert axes["velocity"].levels["none"].told.startswith("no velocity")
     assert "0.2 m/s" in axes["velocity-error"].levels["0.2 m/s"].told
     assert condition_of("a1", "disturbed").told == "its velocity by leg odometry"
+
+
+def test_a_caption_says_which_policies_estimate_their_velocity():
+    told = RobustnessConfig(robot="a1").told(condition_of("a1", "disturbed"))
+    assert told.endswith(
+        "told its velocity by leg odometry; but bridge, gaps, steps, valley estimate the velocity "
+        "from what they sense"
+    )
+    assert "estimate" not in RobustnessConfig(robot="toy").told(condition_of("toy", "undisturbed"))
 
 
 def test_a_report_keeps_every_range_and_which_model():

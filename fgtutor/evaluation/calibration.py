@@ -248,7 +248,8 @@ def run(config: CalibrationConfig) -> int:
 
     def find(rows: list[CalibrationRow]) -> Findings:
         samples = min(row["samples"] for row in rows if row["calibration"])
-        amiss = config.told(config.condition) if config.condition else "as disturbed as in training"
+        usual = "under the usual disturbances of training"
+        amiss = config.told(config.condition) if config.condition else usual
         caption = (
             f"w_ood, and after a slash the AUROC of strangers against own patches. At least "
             f"{samples:,} labelled patches each; robot {config.robot}, tau "

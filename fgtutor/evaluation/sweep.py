@@ -285,7 +285,7 @@ def run(config: SweepConfig) -> int:
             caption=f"Success in % with 95 % intervals, {config.trials} crossings of held-out "
             f"terrain per training, each with its own plan; r_v and calibration error there are "
             f"means over the seeds; robot {config.robot}{iterations}; undisturbed, but r_v and "
-            "calibration error as disturbed as in training.",
+            "calibration error under the usual disturbances of training.",
             figures={"success.svg": report.shares_chart(groups, title)},
         )
 

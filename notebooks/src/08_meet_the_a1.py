@@ -395,8 +395,8 @@ DriveA1(ground, zoo, render=A1View(ground))
 #
 # - Twelve joint angles, six coordinates without a motor; actions are targets for PD controllers.
 # - At rest the gap between target and angle is the torque divided by $k_p$.
-# - The policy reads its body, the command and a scan. Its velocity has to be estimated on a real
-#   robot. The Feasibility-Net reads the patch and the command.
+# - The policy reads ten frames of its body, the command and a scan. From the frames it estimates
+#   its velocity, which no sensor measures. The Feasibility-Net reads the patch and the command.
 # - Rewards are a weighted sum, floored at zero. Style pays only in motion.
 # - The policy is symmetric by construction.
 #
