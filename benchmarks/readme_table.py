@@ -2,9 +2,9 @@
 
 Reads folders that a `fgtutor evaluate` command has finished; replaces what stands between
 `<!-- table NAME -->` and `<!-- end NAME -->` in the page that has these lines. Folders of other
-policies or planners, all else being equal, join the first one's table: a specialist that has
-changed need not wait for the others again. Folders of other settings (the paper's beside ours) have
-a table of their own below, under their own caption.
+policies, planners or terrains, all else being equal, join the first one's table: a specialist that
+has changed need not wait for the others again. Folders of other settings (the paper's beside ours)
+have a table of their own below, under their own caption.
 Use: python benchmarks/readme_table.py NAME FOLDER [FOLDER ...]
 """
 
@@ -21,7 +21,7 @@ from fgtutor.evaluation.report import ROWS, RUN, TABLE, markdown
 from fgtutor.io.storage import atomic_write
 
 PAGES = (Path("README.md"), Path("docs/results.md"))
-FREE = {"policies", "planners", "zoo"}
+FREE = {"policies", "planners", "terrains", "zoo"}
 """Settings in which folders of one table may differ."""
 
 

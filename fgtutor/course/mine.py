@@ -155,8 +155,8 @@ def _clash(question: str, source: str, kept: Mapping[str, str]) -> str:
         for name in written.keys() & theirs.keys():
             if written[name] != theirs[name]:
                 return (
-                    f"`{name}` is another one in what is kept for {other}: rename one of them, or "
-                    f'call reset("{other}") and check both again'
+                    f"`{name}` means something else in what is kept for {other}: rename one of "
+                    f'them, or call reset("{other}") and check both again'
                 )
     return ""
 

@@ -11,6 +11,9 @@
 #   learned by then is kept, and running the cell again goes on
 #
 # Before you plan with what a robot can do, meet a robot, and let it fail.
+#
+# Symbols and references are on the [notation page](../docs/notation.md); equation numbers are the
+# paper's.
 
 # %%
 from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
@@ -109,7 +112,8 @@ film_strip(episode, terrain, route, count=4)
 # $$
 #
 # It is 1 when the velocity $v$ is the commanded $\hat v$. The norm is not squared, so it falls off
-# *steeply*: an error of $\sigma$ leaves $e^{-1} = 0.37$. A larger $\sigma$ would forgive more.
+# *steeply*: an error of $\sigma$ leaves $e^{-1} = 0.37$. The value is the paper's;
+# a larger $\sigma$ would forgive more.
 # Told 0.85 m/s, a robot that is a tenth too slow still earns 0.71, one that stands 0.03.
 
 # %%
@@ -379,7 +383,7 @@ easy, hard = passed["narrow gaps"], passed["the widest gaps"]
 if 40 <= len(curve) <= 85:  # shorter or longer trainings of yours may differ
     assert easy["mine"].successes > easy["roll"].successes
     assert hard["gaps"].successes > hard["mine"].successes
-reveal("At the wider gaps. On narrow ones a short training is enough; more of it buys width.")
+reveal("At the widest gaps. On narrow and medium ones a short training is enough.")
 
 # %% [markdown]
 # *What to see:* the black lines are 95 % intervals. Where two of them overlap widely, these trials

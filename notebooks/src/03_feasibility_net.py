@@ -12,6 +12,9 @@
 # In notebook 02 you saw $r_v$ dip where the ground gets hard. Could one have *known* that from the
 # patch, before going there? A network that knows is half of this course: the **Feasibility-Net**
 # (paper, Sec. III-A). To train it, one only has to watch the policy drive.
+#
+# Symbols and references are on the [notation page](../docs/notation.md); equation numbers are the
+# paper's.
 
 # %%
 from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once

@@ -13,6 +13,9 @@
 # A network always answers. Ask the Feasibility-Net of a robot that has only ever seen smooth hills
 # about a field of steps, and it gives you a number, as calmly as ever. This notebook is about not
 # believing it (paper, Sec. III-B, Eqs. 4 and 5).
+#
+# Symbols and references are on the [notation page](../docs/notation.md); equation numbers are the
+# paper's.
 
 # %%
 from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
@@ -266,8 +269,8 @@ for name, specialist in zoo.items():
     print(f"{name}: {touched:.1%} of its own patches lose weight")
 
 # %% [markdown]
-# A few percent for each of them, whatever its autoencoder: 3 % was the aim. Now all four about all
-# four:
+# A few percent for each of them, whatever its autoencoder: 3 % was the aim. Now let
+# each specialist weigh the patches of each terrain:
 
 # %%
 predict(

@@ -327,6 +327,8 @@ assert "never observed" in hatched and "never observed" not in ridge
 # The route above switches between slopes and rubble several times. On flat ground both are about
 # equally good, and $P$ changes from cell to cell. In the paper's plan switching is free; a
 # real robot may stumble at each switch. So we let a switch cost as much as a metre of ideal ground.
+# For this the planner searches over pairs (cell, policy): a step with policy $p$ costs its length
+# over $F_p$, a change of policy costs 1. ([Exercise 06](../exercises/ex06.ipynb) has you write it.)
 # And a diagonal step costs its length: by $1/F$ alone it costs as much as a straight one. These are
 # our settings, `PlanSettings()`; the paper's are `PAPER`.
 
@@ -338,7 +340,7 @@ assert calm.switches < route.switches and calm.length <= route.length
 compare_routes(M, {"the paper's settings": route, "ours: a switch costs 1 m": calm})
 
 # %% [markdown]
-# *What to see:* fewer switches, and the route is no longer for it.
+# *What to see:* the route has fewer switches, and it is not longer.
 
 # %% [markdown]
 # ## The paper in one file

@@ -160,7 +160,7 @@ from fgtutor.course.ask import predict, reveal
 
 predict(
     "How many switches does the route keep, however dear a switch is?",
-    ["none", "three", "as many as there are cells with another owner"],
+    ["none", "three", "one for each cell on it whose owner is not that of the cell before"],
 )
 
 # %%

@@ -12,6 +12,9 @@
 #
 # So far we had a toy. Here is the robot of the paper (Sec. IV): the Unitree A1, four legs, twelve
 # motors, simulated in MuJoCo. The functions that plan and drive are the same.
+#
+# Symbols and references are on the [notation page](../docs/notation.md); equation numbers are the
+# paper's.
 
 # %%
 from fgtutor.course.diagrams import draw_pipeline  # loads torch: some seconds, once
@@ -184,7 +187,7 @@ yaws["slope on its left"] = -np.pi / 2
 predict("Facing uphill, is the first number (ahead) of gravity positive or negative?")
 
 # %%
-x, y = (four.offsets[0, 0] + torch.tensor((2.0, 2.0))).tolist()
+x, y = (four.offsets[0, 0] + torch.tensor((2.0, 2.0))).tolist()  # tiles lie somewhere in the world
 four.start(torch.arange(4), torch.tensor([(x, y, yaw) for yaw in yaws.values()]), 0.0)
 gravity = four.get_observations()["policy"][:, 6:9]
 for name, numbers in zip(yaws, gravity.tolist(), strict=True):

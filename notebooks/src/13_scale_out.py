@@ -308,7 +308,7 @@ draw_rates({name: (s.successes, s.trials) for name, s in by_policy.items()},
 # %%
 predict(
     "One robot does a few hundred control steps per second. How many do 256 do together?",
-    ["the same", "some tens of times as many", "256 times as many"],
+    ["the same", "10 to 100 times as many", "256 times as many"],
 )
 
 # %%

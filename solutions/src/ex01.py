@@ -9,8 +9,8 @@
 #
 # Write each function below its question, then run the `check` beneath it: it says at once what
 # holds and what does not. Each call of `hint` gives one more hint. The grader runs this notebook
-# from top to bottom and offers it numpy, scipy, networkx and `fgtutor.directions`; functions must
-# not change the arrays they are given.
+# from top to bottom and offers it numpy, scipy, networkx, torch and `fgtutor.directions`; functions
+# must not change the arrays they are given.
 
 # %%
 import numpy as np

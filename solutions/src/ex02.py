@@ -5,7 +5,8 @@
 # fall, write the two formulas at the heart of PPO, and compute a point of a learning curve.
 #
 # About 50 minutes. Needs [notebook 02](../notebooks/02_a_robot_that_falls.ipynb),
-# numpy, and no GPU.
+# numpy, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each function below its question, then run its `check`; `hint("ex02.q1")` gives one more
 # hint at each call, and `solution("ex02.q1")` opens once the check has passed.

@@ -5,7 +5,8 @@
 # rollout, train a net, and test whether what it predicts is true.
 #
 # About 90 minutes. Needs [notebook 03](../notebooks/03_feasibility_net.ipynb),
-# numpy and PyTorch, and no GPU.
+# numpy and PyTorch, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each answer below its question, then run its `check`; `hint("ex03.q1")` gives one more hint
 # at each call, and `solution("ex03.q1")` opens once the check has passed.
@@ -164,7 +165,9 @@ check("ex03.q3", reliability)
 # The label of a step is the mean of `r_v` over the next `window` steps, from the step itself on,
 # and never reaches into the next episode. If a **fall** ends the window early, the steps that never
 # happened count as zeros: divide by `window`. If a **time-out** or the end of the rollout ends it
-# early, they do not count: divide by the steps that there were.
+# early, they do not count: divide by the steps that there were. (As in ex02.q2, `r_v[t]` is what
+# step $t$ itself earned. In notebook 03 row $t$ tells of the step before it, so there the mean
+# begins one row later.)
 #
 # Some labels stand on too little. A label is `trusted` if its window ends with a fall, or if at
 # least half of the window was seen.

@@ -5,7 +5,8 @@
 # and say when a place closes.
 #
 # About 25 minutes. Needs [notebook 04](../notebooks/04_have_i_seen_this_before.ipynb),
-# numpy, and no GPU.
+# numpy, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each function below its question, then run its `check`; `hint("ex04.q1")` gives one more
 # hint at each call, and `solution("ex04.q1")` opens once the check has passed.

@@ -6,7 +6,8 @@
 # decoding, and update a tensor where the map has changed.
 #
 # About 75 minutes. Needs [notebook 05](../notebooks/05_from_map_to_tensor.ipynb),
-# numpy, and no GPU.
+# numpy, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each function below its question, then run its `check`; `hint("ex05.q1")` gives one more
 # hint at each call, and `solution("ex05.q1")` opens once the check has passed.

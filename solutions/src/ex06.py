@@ -5,7 +5,8 @@
 # search with a heap, check a route's cost by hand, and plan with a price on switching.
 #
 # About 100 minutes. Needs [notebook 06](../notebooks/06_fuse_and_plan.ipynb),
-# numpy, and no GPU.
+# numpy, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each function below its question, then run its `check`; `hint("ex06.q1")` gives one more
 # hint at each call, and `solution("ex06.q1")` opens once the check has passed.

@@ -5,7 +5,8 @@
 # and switch policies without flicker.
 #
 # About 50 minutes. Needs [notebook 07](../notebooks/07_drive_the_plan.ipynb),
-# numpy, and no GPU.
+# numpy, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each function below its question, then run its `check`; `hint("ex07.q1")` gives one more
 # hint at each call, and `solution("ex07.q1")` opens once the check has passed.

@@ -5,7 +5,8 @@
 # mirror the robot, and watch a joint swing to its target.
 #
 # About 45 minutes. Needs [notebook 08](../notebooks/08_meet_the_a1.ipynb),
-# numpy, and no GPU.
+# numpy, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each function below its question, then run its `check`; `hint("ex08.q1")` gives one more
 # hint at each call, and `solution("ex08.q1")` opens once the check has passed.

@@ -5,7 +5,8 @@
 # time-outs, and explain why the learning rate in the log goes up and down.
 #
 # About 45 minutes. Needs [notebook 09](../notebooks/09_train_a_specialist.ipynb),
-# numpy, and no GPU.
+# numpy, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each function below its question, then run its `check`; `hint("ex09.q1")` gives one more
 # hint at each call, and `solution("ex09.q1")` opens once the check has passed.

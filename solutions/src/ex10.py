@@ -4,7 +4,8 @@
 # **You will be able to** measure a walk, compute SPL, and read a published table backwards.
 #
 # About 20 minutes. Needs [notebook 10](../notebooks/10_planning_adapts.ipynb),
-# numpy, and no GPU.
+# numpy, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each function below its question, then run its `check`; `hint("ex10.q1")` gives one more
 # hint at each call, and `solution("ex10.q1")` opens once the check has passed.

@@ -5,7 +5,8 @@
 # which of two planners is better.
 #
 # About 60 minutes. Needs [notebook 11](../notebooks/11_mixed_terrain.ipynb),
-# numpy, and no GPU.
+# numpy, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each function below its question, then run its `check`; `hint("ex11.q1")` gives one more
 # hint at each call, and `solution("ex11.q1")` opens once the check has passed.

@@ -5,7 +5,8 @@
 # gets, plan with a price on switching, and read Table III.
 #
 # About 50 minutes. Needs [notebook 12](../notebooks/12_from_a_scan_to_a_walk.ipynb),
-# numpy, and no GPU.
+# numpy, and no GPU. You may import
+# what [exercise 01](ex01.ipynb) lists.
 #
 # Write each function below its question, then run its `check`; `hint("ex12.q1")` gives one more
 # hint at each call, and `solution("ex12.q1")` opens once the check has passed.
