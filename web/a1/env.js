@@ -152,9 +152,16 @@ export class A1Env {
     observation.set(command, felt);
     const scan = observation.subarray(felt + 3);
     this.scan(scan);
-    frames.set(observation.subarray(3, felt + 3), frames.length && frames.length - felt);
+    if (frames.length) frames.set(observation.subarray(3, felt + 3), frames.length - felt);
     const all = { policy: observation, history: frames, scan };
-    return Float32Array.from(groups.flatMap((group) => [...all[group]]));
+    const read = groups.map((group) => all[group]);
+    const seen = new Float32Array(read.reduce((sum, { length }) => sum + length, 0));
+    at = 0;
+    for (const numbers of read) {
+      seen.set(numbers, at);
+      at += numbers.length;
+    }
+    return seen;
   }
 
   /** Write heights around the robot relative to its trunk, centred and scaled. */
