@@ -76,7 +76,7 @@ class TrainConfig:
     policies that shall hold under disturbance and on other models."""
     gait: Gait = "trot"
     """How the feet of a robot with legs take turns: in diagonal pairs, or one after another, which
-    needs less friction."""
+    suits joints that are damped strongly."""
     hours: NonNegative = 0.0
     """Stop and save after this many hours; --resume goes on. 0 sets no limit."""
     iterations: Count = 200
