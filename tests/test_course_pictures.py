@@ -121,6 +121,8 @@ def test_routes_are_compared_and_a_missing_one_says_why():
     routes = {"one": one, "none": "no route: the ridge", "refused": closed}
     figure = route_pictures.compare_routes(terrain.elevation, routes)
     captions = {axes.get_title(loc="left"): axes.get_xlabel() for axes in figure.axes}
+    assert {words.partition("\n")[0] for words in captions.values()} == {"x (m)"}
+    captions = {title: words.partition("\n")[2] for title, words in captions.items()}
     assert captions["none"] == "no route: the ridge" and "m, policy" in captions["one"]
     assert captions["refused"] == "no chain of steps joins them"
     (legend,) = figure.legends

@@ -82,7 +82,8 @@ def test_every_typical_mistake_fails_and_is_named(question):
 @BY_ID
 def test_cases_follow_from_the_seed(question):
     def plain(seed):
-        return repr(question.cases(seed))
+        with np.printoptions(threshold=10**7):  # every number, or two maps may look the same
+            return repr(question.cases(seed))
 
     assert plain(3) == plain(3)
     if question.draw:
