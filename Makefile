@@ -4,6 +4,7 @@
 #   make test       every test          make test-fast  those that take under a minute together
 #   make lab        JupyterLab on your copy of the course, on this machine only
 #   make notebooks  execute the notebooks' sources in full   make exercises  build them from their masters
+#   make slides     a slide show of each notebook, in slides/
 #   make site       the course, the planner and the A1 as web pages, in site/
 #   make test-wheel install wheel and source archive into fresh environments of each Python, and use them
 #   make bench      every benchmark, for an idle machine    make bench-quick  smaller sizes of each
@@ -16,7 +17,7 @@ BIN := $(VENV)/bin
 BASE := $(VENV)/.installed-base
 ALL := $(VENV)/.installed-all
 
-.PHONY: demo browser lab notebooks exercises site test test-fast test-wheel bench bench-quick check clean
+.PHONY: demo browser lab notebooks slides exercises site test test-fast test-wheel bench bench-quick check clean
 .DELETE_ON_ERROR:
 
 demo: $(BASE)
@@ -52,6 +53,12 @@ lab: $(ALL)
 notebooks: $(ALL)
 	$(BIN)/fgtutor notebooks
 
+slides: $(ALL) web/node_modules/.package-lock.json
+	@mkdir -p slides
+	cp -r web/node_modules/reveal.js web/node_modules/requirejs/require.js web/node_modules/jquery/dist/jquery.min.js slides
+	$(BIN)/jupyter nbconvert --to slides --output-dir slides --SlidesExporter.reveal_url_prefix=reveal.js \
+	  --SlidesExporter.require_js_url=require.js --SlidesExporter.jquery_url=jquery.min.js notebooks/*.ipynb
+
 exercises: $(ALL)
 	$(BIN)/fgtutor exercises
 
@@ -79,7 +86,7 @@ check: $(ALL)
 	$(BIN)/pyright
 
 clean:
-	rm -rf $(VENV) demo site build *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache web/node_modules web/.cache
+	rm -rf $(VENV) demo site slides build *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache web/node_modules web/.cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A version manager may put a python3.13 on the path that does not start: each candidate is tried.

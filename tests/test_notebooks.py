@@ -9,11 +9,18 @@ from pathlib import Path
 import nbformat
 import numpy as np
 import pytest
-from nbformat.v4 import new_code_cell, new_notebook, new_output
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 from PIL import Image
 
 from fgtutor.course import notebooks
-from fgtutor.course.notebooks import NotebooksConfig, budget, find_drift, find_faults, read_source
+from fgtutor.course.notebooks import (
+    NotebooksConfig,
+    budget,
+    find_drift,
+    find_faults,
+    read_source,
+    slide_of,
+)
 from fgtutor.errors import ConfigError, NotebookError
 
 COURSE = Path(__file__).parent.parent / "notebooks"
@@ -288,3 +295,13 @@ def test_the_budget_says_which_one_is_in_force(monkeypatch, capsys):
     monkeypatch.setenv("FGTUTOR_FAST", "1")
     assert budget(fast=5, full=600) == 5
     assert capsys.readouterr().out == "fast: 5 rounds; without FGTUTOR_FAST=1: 600 rounds\n"
+
+
+def test_a_heading_begins_a_slide_and_a_picture_one_below():
+    assert slide_of(new_markdown_cell("## Title"))["slideshow"] == {"slide_type": "slide"}
+    assert slide_of(new_markdown_cell("text")) == slide_of(new_code_cell("1")) == {}
+    drawn = new_code_cell("draw()", outputs=[shown("AAAA")])
+    assert slide_of(drawn)["slideshow"] == {"slide_type": "subslide"}
+    for built in BUILT:
+        for cell in nbformat.read(built, 4).cells:
+            assert cell.metadata == slide_of(cell), f"{built.name}: {cell.source:.60}"

@@ -91,6 +91,14 @@ def read_source(source: Path) -> NotebookNode:
     return notebook
 
 
+def slide_of(cell: NotebookNode) -> dict[str, Any]:
+    """Return what `make slides` reads in a cell: a heading begins a slide, a picture one below."""
+    heading = cell.cell_type == "markdown" and cell.source.startswith("#")
+    picture = any("image/png" in output.get("data", {}) for output in cell.get("outputs", ()))
+    kind = "slide" if heading else "subslide" if picture else ""
+    return {"slideshow": {"slide_type": kind}} if kind else {}
+
+
 def build(source: Path, *, fast: bool = False, timeout: int = 900) -> NotebookNode:
     """Execute a source in an empty folder, in full or in fast mode; keep what readers should see.
 
@@ -121,9 +129,9 @@ def build(source: Path, *, fast: bool = False, timeout: int = 900) -> NotebookNo
         except (CellExecutionError, CellTimeoutError, DeadKernelError) as error:
             raise NotebookError(f"{source.name} does not run: {error}") from error
     for cell in notebook.cells:
-        cell.metadata = {}
         if cell.cell_type == "code":
             cell.outputs = list(_kept(cell.outputs, f"{source.name}, cell {cell.id}"))
+        cell.metadata = slide_of(cell)
     notebook.metadata.pop("widgets", None)
     notebook.metadata["language_info"] = {"name": "python"}  # the kernel adds its version
     notebook.metadata["fgtutor"] = {"fast": fast, "specialists": specialists_of(notebook)}
