@@ -504,9 +504,9 @@ def test_an_estimating_run_starts_from_a_shipped_policy_and_resumes_exactly(tmp_
 
 
 def test_a_robot_without_wide_disturbances_says_so(tmp_path):
-    with pytest.raises(ConfigError, match="knows no wide disturbances"):
+    with pytest.raises(ConfigError, match="toy knows no wide disturbances"):
         Trainer(tiny(tmp_path, disturbances="wide"))
-    with pytest.raises(ConfigError, match="knows no gait to walk in"):
+    with pytest.raises(ConfigError, match="toy knows no gait to walk in"):
         Trainer(tiny(tmp_path, gait="walk"))
 
 

@@ -63,8 +63,10 @@ class ZooConfig(RunConfig):
         """Say what is amiss and what the policies know of their motion, for a caption."""
         said = f"{condition.words}; told {condition.told}"
         blind = [name for name, specialist in self.load_zoo().items() if specialist.history]
-        who = f"{', '.join(blind)} estimate" if len(blind) > 1 else "".join(blind) + " estimates"
-        return f"{said}; but {who} the velocity from what they sense" if blind else said
+        if not blind:
+            return said
+        estimate = "estimate" if len(blind) > 1 else "estimates"
+        return f"{said}; but {', '.join(blind)} {estimate} the velocity from what they sense"
 
     def zoo_digests(self) -> dict[str, str]:
         """Return a digest of each of them, which changes with any of its weights."""

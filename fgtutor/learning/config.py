@@ -265,7 +265,15 @@ def training_tile(
 def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
     """Build the robots on the world in which training goes on from `iteration`."""
     make = env_class(config.robot)
-    options = make.training_options(disturbances=config.disturbances, gait=config.gait)
+    if config.disturbances not in make.disturbances:
+        raise ConfigError(
+            f"{config.robot} knows no {config.disturbances} disturbances: leave them usual"
+        )
+    settings = make.disturbances[config.disturbances]
+    if config.gait != "trot":
+        if not hasattr(settings, "gait"):
+            raise ConfigError(f"{config.robot} knows no gait to {config.gait} in: leave it out")
+        settings = dataclasses.replace(settings, gait=config.gait)
     return make(
         training_world(config, iteration),
         config.num_envs,
@@ -276,7 +284,7 @@ def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
         ),
         seed=config.seed,
         device=config.device,
-        **options,
+        **({"settings": settings} if settings else {}),
     )
 
 

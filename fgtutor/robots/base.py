@@ -7,8 +7,8 @@ episodes lead is the work of `crossings`. A robot adds its physics in a handful 
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -65,6 +65,9 @@ class LocomotionEnv(VecEnv):
     """Which numbers of the `policy` group a blind robot observes: neither velocity nor scan."""
     unfelt: tuple[int, ...] = ()
     """Which three of its numbers it has to estimate instead: its velocity."""
+    disturbances: ClassVar[Mapping[str, Any]] = {"usual": None}
+    """Kinds of disturbance that training may ask for, and the `settings` of each; None: the class's
+    own. Settings with a field `gait` are those of a robot that can be asked for one."""
 
     @plain_tensors
     def __init__(
@@ -114,20 +117,6 @@ class LocomotionEnv(VecEnv):
                 )
             self.history = History(self.config.history, len(self.felt), num_envs, device)
         self.reseed(seed)
-
-    @classmethod
-    def training_options(cls, *, disturbances: str, gait: Gait) -> dict[str, Any]:
-        """Return arguments of this class for a training with such disturbances and gait.
-
-        Raises `ConfigError` for any but usual and trot; a robot that has more overrides this.
-        """
-        if disturbances != "usual":
-            raise ConfigError(
-                f"{cls.__name__} knows no {disturbances} disturbances: leave them usual"
-            )
-        if gait != "trot":
-            raise ConfigError(f"{cls.__name__} knows no gait to {gait} in: leave it out")
-        return {}
 
     # What a robot adds ------------------------------------------------------------------------
 

@@ -11,7 +11,6 @@ those on which evaluation measures mixed terrain (`success.make_ground`), undist
 # pyright: reportAttributeAccessIssue=false
 
 import base64
-import gzip
 import shutil
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
@@ -20,7 +19,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from exports import as_json, copy_specialist, pack
+from exports import PACKED, as_json, copy_specialist, pack
 from matplotlib.colors import to_rgb
 
 from fgtutor.baselines import OURS, ours
@@ -42,13 +41,13 @@ from fgtutor.world.terrain import World
 
 PACKAGES = Path(__file__).parents[1] / "node_modules"
 """Where npm put the packages of web/package.json."""
-VENDOR = (
-    "@mujoco/mujoco/mujoco.js",
-    "@mujoco/mujoco/mujoco.wasm",
-    "three/build/three.module.min.js",
-    "three/build/three.core.min.js",
-)
-"""What the page needs of them; WebAssembly and the 3-D library are compressed."""
+VENDOR = {
+    "@mujoco/mujoco/mujoco.js": False,
+    "@mujoco/mujoco/mujoco.wasm": True,
+    "three/build/three.module.min.js": True,
+    "three/build/three.core.min.js": True,
+}
+"""What the page needs of them, and whether it is compressed."""
 CONFIG = TrialsConfig(robot="a1")
 """How evaluation draws grounds and plans over them, by default."""
 GROUNDS = 20
@@ -68,10 +67,10 @@ def export(folder: Path, count: int = GROUNDS) -> None:
     plans = plan_grounds(zoo, count)
     entries = []
     for index, trial in enumerate(drive(plans, zoo)):
-        plan, file = trial.planned, f"grounds/{index:02d}.json.gz"
+        plan, file = trial.planned, f"grounds/{index:02d}.json"
         ground = describe_ground(trial)
-        (folder / file).write_bytes(gzip.compress(as_json(ground), mtime=0))
-        entries.append({"seed": plan.ground.terrain.seed, "file": file})
+        pack(as_json(ground), folder / file)
+        entries.append({"seed": plan.ground.terrain.seed, "file": file + PACKED})
         if not index:
             scene = scene_of(plan)
             (folder / "robot.json").write_bytes(as_json(describe_robot(scene, zoo)))
@@ -82,11 +81,11 @@ def export(folder: Path, count: int = GROUNDS) -> None:
 def copy_packages(folder: Path) -> None:
     """Copy simulator and 3-D library; raises `FileNotFoundError` if npm has not installed them."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in VENDOR:
+    for name, packed in VENDOR.items():
         source = PACKAGES / name
         if not source.is_file():
             raise FileNotFoundError(f"{source} is missing: run `npm install` in {PACKAGES.parent}")
-        if source.suffix == ".wasm" or source.name.startswith("three"):
+        if packed:
             pack(source.read_bytes(), folder / source.name)
         else:
             shutil.copyfile(source, folder / source.name)

@@ -11,8 +11,8 @@ policy that trains on two CPU cores, adds a gait clock and left-right symmetry.
 
 import math
 import warnings
-from dataclasses import asdict, fields, replace
-from typing import Any
+from dataclasses import asdict, fields
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ from fgtutor.robots.a1.observation import NOISE, SCAN_GRID, SCAN_LIMIT, SCAN_SCA
 from fgtutor.robots.a1.physics import Physics
 from fgtutor.robots.a1.randomise import WIDE, A1EnvConfig, Bodies, delayable, randomise
 from fgtutor.robots.a1.sensing import Senses
-from fgtutor.robots.base import Gait, Layout, LocomotionEnv
+from fgtutor.robots.base import Layout, LocomotionEnv
 from fgtutor.robots.crossings import EnvConfig
 from fgtutor.world.terrain import World
 
@@ -81,6 +81,7 @@ class A1Env(LocomotionEnv):
     mirror = observation.mirror()
     episodes = A1_EPISODES
     felt, unfelt = observation.FELT, observation.UNFELT
+    disturbances: ClassVar = {"usual": A1EnvConfig(), "wide": WIDE}
 
     def __init__(
         self,
@@ -281,12 +282,6 @@ class A1Env(LocomotionEnv):
     def truth(self, policy: Tensor) -> Float[Tensor, "envs 3"]:
         """Return the trunk's velocity in its own frame, without noise, scaled as observed."""
         return (self.body_velocity * self.scale[:3]).clamp(-20.0, 20.0)
-
-    @classmethod
-    def training_options(cls, *, disturbances: str, gait: Gait) -> dict[str, Any]:
-        """Return the settings of a training: the usual ranges, or `WIDE` ones, and a gait."""
-        settings = {"usual": A1EnvConfig(), "wide": WIDE}[disturbances]
-        return {"settings": replace(settings, gait=gait)}
 
     def conditions(self) -> dict[str, Any]:
         """Return the settings and the model, as plain values."""
