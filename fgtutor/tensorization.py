@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from fgtutor.specialist import Specialist
 
 
-CACHED = 2304
+CACHED = 1024
 """Patches that the networks are asked about at once: as many as stay in a core's cache."""
 
 
@@ -290,18 +290,23 @@ def _ask(
     team: Mapping[str, Specialist], patch: Float[Tensor, "n points"]
 ) -> dict[str, Float[Tensor, "3 n"]]:
     """Return f, L_recon and the strangeness of patches, by each specialist."""
+    nets = {
+        name: one.feasibility.folded(torch.tensor(one.command, dtype=torch.float32))
+        for name, one in team.items()
+    }
     found = {name: torch.empty(3, len(patch)) for name in team}
     for first in range(0, len(patch), CACHED):
         part = patch[first : first + CACHED]
-        reliefs: dict[tuple[float, float | None], Tensor] = {}
+        reliefs: dict[tuple[float, float | None], tuple[Tensor, Tensor]] = {}
         for name, specialist in team.items():
             net = specialist.feasibility
-            command = torch.tensor(specialist.command, dtype=torch.float32)
-            seen = net.height_scale, net.saturation
-            if seen not in reliefs:
-                reliefs[seen] = net.relief(part)
-            f = net.feasibility(part, command.expand(len(part), -1))
-            found[name][:, first : first + CACHED] = torch.stack((f, *net.losses(reliefs[seen])))
+            units = net.height_scale, net.saturation
+            if units not in reliefs:
+                heights = net.relief(part)
+                reliefs[units] = heights, 1 + heights.square().sum(dim=-1)
+            heights, most = reliefs[units]
+            f, loss = nets[name].feasibility(part), nets[name].reconstruction(heights)
+            found[name][:, first : first + CACHED] = torch.stack((f, loss, loss / most))
     return found
 
 

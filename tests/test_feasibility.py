@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch import nn
 
 from fgtutor.errors import ThresholdError
 from fgtutor.feasibility import FeasibilityNet, ood_weight
@@ -83,6 +84,25 @@ def test_the_height_scale_enters_squared(blank):
 def test_reconstruction_is_the_same_in_training_mode(net):
     patch = torch.randn(4, POINTS)
     torch.testing.assert_close(net.train().reconstruction(patch), net.eval().reconstruction(patch))
+
+
+@pytest.mark.parametrize("saturation", [None, 0.15])
+@pytest.mark.parametrize("command", [(0.65, 0.0, 0.0), (-0.3, 0.2, 1.0)])
+def test_a_folded_net_says_the_same(saturation, command):
+    net = FeasibilityNet(
+        POINTS, hidden=(16, 8), vae_hidden=(24, 12), latent=5, saturation=saturation
+    )
+    torch.manual_seed(0)
+    for weight in net.parameters():  # not the small ones of a fresh net
+        nn.init.normal_(weight, std=0.5)
+    patch, told = 0.3 * torch.randn(200, POINTS), torch.tensor(command)
+    heights, folded = net.relief(patch), net.folded(told)
+    close = torch.testing.assert_close
+    close(
+        folded.feasibility(patch), net.feasibility(patch, told.expand(200, -1)), rtol=0, atol=1e-6
+    )
+    close(folded.reconstruction(heights), net.losses(heights)[0], rtol=1e-5, atol=1e-5)
+    assert folded.feasibility(patch).std() > 0.1
 
 
 def test_loss_by_hand(blank):

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from fgtutor import directions, patches, tiles
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, ThresholdError, TooLargeError
+from fgtutor.feasibility import FoldedNet
 from fgtutor.io import machine, progress
 from fgtutor.patches import PatchGrid
 from fgtutor.tensorization import (
@@ -179,9 +180,11 @@ def test_equal_patches_are_assessed_once(make_specialist, monkeypatch):
     heights[10:] = 0.1  # along y all cells look alike, but those near the border
     elevation, specialist = ElevationMap(heights, resolution=0.1), make_specialist()
     asked = []
-    plain = specialist.feasibility.reconstruction
+    plain, folded = specialist.feasibility.reconstruction, FoldedNet.reconstruction
     monkeypatch.setattr(
-        specialist.feasibility, "reconstruction", lambda p: (asked.append(len(p)), plain(p))[1]
+        FoldedNet,
+        "reconstruction",
+        lambda net, heights: (asked.append(len(heights)), folded(net, heights))[1],
     )
     assessment = assess(elevation, specialist)
     assert sum(asked) < 0.1 * 8 * heights.size
