@@ -503,9 +503,7 @@ def test_an_estimating_run_starts_from_a_shipped_policy_and_resumes_exactly(tmp_
     assert conditions["friction"] == WIDE.friction and conditions["delay"] == WIDE.delay
 
 
-def test_a_robot_without_wide_disturbances_says_so(tmp_path):
-    with pytest.raises(ConfigError, match="toy knows no wide disturbances"):
-        Trainer(tiny(tmp_path, disturbances="wide"))
+def test_a_robot_without_legs_knows_no_gait(tmp_path):
     with pytest.raises(ConfigError, match="toy knows no gait to walk in"):
         Trainer(tiny(tmp_path, gait="walk"))
 

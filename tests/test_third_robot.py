@@ -11,7 +11,7 @@ from fgtutor.cli.export import describe
 from fgtutor.errors import ConfigError
 from fgtutor.evaluation.switching import SwitchingConfig, courses
 from fgtutor.figures.videos import film_of
-from fgtutor.learning.config import TrainConfig, config_of
+from fgtutor.learning.config import TrainConfig, config_of, make_training_env
 from fgtutor.robots import ROBOTS, Robot
 from fgtutor.world.obstacles import TerrainScale
 
@@ -31,6 +31,12 @@ def puck(monkeypatch):
 @pytest.mark.parametrize("contract", CONTRACT, ids=lambda test: test.__name__)
 def test_it_keeps_the_contract_of_all_robots(contract):
     contract("puck")
+
+
+def test_it_has_no_wide_disturbances_and_says_so(tmp_path):
+    config = TrainConfig(robot="puck", terrain="steps", out=tmp_path, disturbances="wide")
+    with pytest.raises(ConfigError, match="puck knows no wide disturbances: leave them usual"):
+        make_training_env(config)
 
 
 @pytest.mark.slow

@@ -1,4 +1,5 @@
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ import torch
 
 from fgtutor.elevation import ElevationMap
 from fgtutor.robots.crossings import EnvConfig
-from fgtutor.robots.toy import STOREY, ToyEnv, polyline
+from fgtutor.robots.toy import STOREY, WIDE, ToyEnv, ToyModel, polyline
 from fgtutor.world.terrain import Terrain, World
 
 
@@ -96,6 +97,27 @@ def test_one_robot_does_not_touch_another():
     roll(alone, 1.0)
     roll(crowd, 1.0)
     assert place(crowd) == pytest.approx(np.repeat(place(alone), 3, axis=0), abs=1e-6)
+
+
+def test_wide_disturbances_make_every_toy_another_and_the_same_seed_the_same():
+    terrain = Terrain.from_elevation(ElevationMap(FLAT), (1, 1), (2, 1))
+    options = {"config": EnvConfig(train=False), "settings": WIDE}
+    env, again, other = (ToyEnv(World([[terrain]]), 20, seed=k, **options) for k in (3, 3, 4))
+    assert env.models == again.models != other.models
+    own = ToyModel()
+    for name, (low, high) in asdict(WIDE).items():
+        drawn = np.array([getattr(one, name) for one in env.models]) / getattr(own, name)
+        assert low <= drawn.min() < drawn.max() <= high and np.ptp(drawn) > 0.5 * (high - low)
+    chassis = [bodies[0].mass for bodies in env.bodies]
+    assert chassis == [one.chassis_mass for one in env.models]
+    # Heavier toys on weaker springs stand lower: the drawn bodies are those that are simulated.
+    place = torch.tensor([[1.0, 1.0, 0.0]]).repeat(20, 1)
+    place[:, :2] += env.crossings.corner(torch.arange(20))
+    env.start(torch.arange(20), place, 0.5)
+    roll(env, 1.0)
+    sag = [one.chassis_mass / one.leg_stiffness for one in env.models]
+    assert np.corrcoef(sag, env.motion()[0][:, 2].numpy())[0, 1] < -0.9
+    assert set(ToyEnv(World([[terrain]]), 3, config=EnvConfig()).models) == {own}
 
 
 def test_a_robot_on_the_border_sees_its_edge_continue():

@@ -11,8 +11,8 @@ Yaw is kinematic: the turn rate is the command's, whatever the wheels do.
 
 import itertools
 import math
-from dataclasses import dataclass
-from typing import Annotated, Any
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import pymunk
@@ -46,6 +46,9 @@ DROP = 0.28
 """An axle this far below the ground on both sides has dropped into a hole, m."""
 HOLE = 0.45
 """How far from an axle that ground is looked for, m."""
+
+Factors = Annotated[tuple[Positive, Positive], Ascending]
+"""Least and greatest factor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +92,33 @@ class ToyModel:
         check_fields(self)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ToySpread:
+    """How toys of a batch differ: ranges of factors on numbers of `ToyModel`, drawn evenly."""
+
+    friction: Factors = (1.0, 1.0)
+    chassis_mass: Factors = (1.0, 1.0)
+    wheel_torque: Factors = (1.0, 1.0)
+    leg_stiffness: Factors = (1.0, 1.0)
+    leg_damping: Factors = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def draw(self, model: ToyModel, rng: np.random.Generator) -> ToyModel:
+        """Return another body."""
+        factors = {name: rng.uniform(*ends) for name, ends in asdict(self).items()}
+        return replace(model, **{name: f * getattr(model, name) for name, f in factors.items()})
+
+
+WIDE = ToySpread(
+    friction=(0.7, 1.1),
+    chassis_mass=(0.9, 1.4),
+    wheel_torque=(0.8, 1.1),
+    leg_stiffness=(0.8, 1.1),
+    leg_damping=(0.7, 1.2),
+)
+"""For policies that shall hold under evaluation's preset (`toy_conditions`), and beyond it."""
 TOY_GRID = PatchGrid(ahead=1.2, behind=0.5, half_width=0.2, footprint=(0.3, 0.1))
 """The toy's patch: 18 x 5 points, mostly ahead, since it looks before it leaps."""
 
@@ -115,14 +145,26 @@ class ToyEnv(LocomotionEnv):
     grid = TOY_GRID
     # Without its speeds and its height above the ground; with the command.
     felt, unfelt = (0, 1, 2, *range(6, 21)), (3, 4, 5)
+    disturbances: ClassVar = {"usual": ToySpread(), "wide": WIDE}
 
     def __init__(
-        self, world: World, num_envs: int = 64, *, model: ToyModel | None = None, **options: Any
+        self,
+        world: World,
+        num_envs: int = 64,
+        *,
+        model: ToyModel | None = None,
+        settings: ToySpread | None = None,
+        seed: int = 0,
+        **options: Any,
     ) -> None:
-        """Build the space; the further options are those of `LocomotionEnv`."""
-        self.model = model or ToyModel()
+        """Build the space; the further options are those of `LocomotionEnv`.
+
+        By `settings` the toys differ from `model` and from one another; None: they do not.
+        """
+        self.model, self.settings = model or ToyModel(), settings or ToySpread()
+        self.body_seed = seed
         self.control_dt = self.model.dt * self.model.substeps
-        super().__init__(world, num_envs, **options)
+        super().__init__(world, num_envs, seed=seed, **options)
         self.ground = world.elevation.filled().heights.astype(np.float64)
         self.reset_all()
 
@@ -131,6 +173,8 @@ class ToyEnv(LocomotionEnv):
     def rebuild(self) -> None:
         """Build the space anew: no cached contact survives, so resuming is exact."""
         n = self.num_envs
+        rng = np.random.default_rng(self.body_seed)
+        self.models = [self.settings.draw(self.model, rng) for _ in range(n)]
         self.space = pymunk.Space()
         self.space.gravity = (0.0, -9.81)
         self.space.iterations = 12
@@ -151,7 +195,7 @@ class ToyEnv(LocomotionEnv):
 
     def _build_robot(self, i: int) -> None:
         """Add robot i: a chassis, and two wheels that slide on grooves under spring and motor."""
-        m = self.model
+        m = self.models[i]
         chassis = pymunk.Body(m.chassis_mass, pymunk.moment_for_box(m.chassis_mass, m.chassis_size))
         box = pymunk.Poly.create_box(chassis, m.chassis_size, radius=0.01)
         box.friction = 0.4
@@ -294,7 +338,7 @@ class ToyEnv(LocomotionEnv):
         pool, used = self.segments[i], len(vertices) - 1
         while len(pool) < used:
             segment = pymunk.Segment(self.space.static_body, PARKED, PARKED, 0.0)
-            segment.friction = self.model.friction
+            segment.friction = self.models[i].friction
             self.space.add(segment)
             pool.append(segment)
         spare = [(PARKED, PARKED)] * (self.laid[i] - used)
@@ -320,6 +364,10 @@ class ToyEnv(LocomotionEnv):
         pose = np.concatenate((self._position(), self.state[:, 0, 1:2], self.yaw[:, None]), axis=1)
         velocity = np.stack((self.speed, np.zeros(self.num_envs), self.yaw_rate), axis=1)
         return self._tensor(pose), self._tensor(velocity)
+
+    def conditions(self) -> dict[str, Any]:
+        """Return how the toys differ, and the body that they differ from, as plain values."""
+        return {"settings": asdict(self.settings), "model": asdict(self.model)}
 
     def proprioception(self) -> Float[Tensor, "envs 18"]:
         """Return pitch, speeds, height above ground, legs, wheel speeds and the last action."""
