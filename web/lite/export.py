@@ -15,37 +15,38 @@ import tarfile
 import tempfile
 import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from book.stage import links
+from book.stage import NEEDS_TORCH, links
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 MODULES = HERE.parent / "node_modules"
 KERNEL = "@jupyterlite/pyodide-kernel-extension"
+EXTENSION = Path(sys.prefix) / "share/jupyter/labextensions" / KERNEL
 CORE = ("pyodide.js", "pyodide.mjs", "pyodide.asm.js", "pyodide.asm.wasm", "python_stdlib.zip")
 """What there is of Pyodide's own: `.mjs` is for the test in Node."""
 ABSENT = ("ssl", "sqlite3", "jedi")
 """What JupyterLite's kernel asks for by name and does without: an empty wheel answers it."""
 KERNEL_WHEELS = ("piplite", "pyodide_kernel", "ipykernel")
-NEEDS_TORCH = ("ex03", "ex13")
-"""Exercises that are not there."""
 DROPPED = ("tests", "f2py", "_pyinstaller", "include")
 """Folders of numpy that no exercise needs."""
 DROPPED_ENDS = (".a", ".h", ".pyi", ".pyx", ".pxd", ".pyc")
+OLD_FONTS = ("fa-*.eot", "fa-*.svg", "fa-*.ttf", "fa-*.woff")
 TOP = """\
-**In the browser.** Python runs in this page, with numpy and the checks; nothing is sent anywhere. The
-first cell takes a few seconds. Torch, scipy, networkx and matplotlib are not here, and no time limit
-ends a loop that never does: *Kernel*, *Restart Kernel*. The browser keeps your notebook and `mine.py`
-for this address until you clear its data: to save them elsewhere, right-click them in the list of
-files, *Download*."""
+**In the browser.** Python runs in this page, with numpy and the checks; nothing is sent anywhere.
+It takes some ten seconds to start, longer the first time. Torch, scipy, networkx and matplotlib are not here, and no time
+limit ends a loop that never does: *Kernel*, *Restart Kernel*. The browser keeps your notebook and
+`mine.py` for this address until you clear its data: to save them elsewhere, right-click them in the
+list of files, *Download*."""
 OWN = """\
 ## Your own planner
 
-What has passed is kept in `mine.py`, beside this notebook. The planner with your functions in place of
-the library's needs torch, so it runs where fgtutor is installed: download `mine.py`, put it beside the
-exercises there, and run this cell."""
+What has passed is kept in `mine.py`, beside this notebook. The planner with your functions in place
+of the library's needs torch, so it runs where fgtutor is installed: download `mine.py`, put it
+beside the exercises there, and run this cell."""
 
 
 def names() -> list[str]:
@@ -54,32 +55,40 @@ def names() -> list[str]:
     return [name for name in every if name not in NEEDS_TORCH]
 
 
+def missing() -> list[str]:
+    """Return what the site is made of and is not installed."""
+    needed = (EXTENSION, MODULES / "pyodide", MODULES / "@emscripten-forge/numpy")
+    return [str(path) for path in needed if not path.is_dir()]
+
+
 def export(out: Path) -> None:
     """Write the site; raises `SystemExit` if something that it is made of is not installed."""
-    extension = Path(sys.prefix) / "share/jupyter/labextensions" / KERNEL
-    for needed in (extension, MODULES / "pyodide", MODULES / "@emscripten-forge/numpy"):
-        if not needed.is_dir():
-            raise SystemExit(f"{needed} is not there: run `make site`, which installs it")
+    if missing():
+        raise SystemExit(f"not there: {', '.join(missing())}; `make site` installs it")
     with tempfile.TemporaryDirectory() as scratch:
         work = Path(scratch)
-        write_pyodide(work / "static/pyodide", extension / "static/pypi")
+        write_pyodide(work / "static/pyodide")
         for name in names():
             content = json.loads((ROOT / f"exercises/{name}.ipynb").read_text(encoding="utf-8"))
             (work / f"{name}.ipynb").write_text(json.dumps(adapted(content, name)))
-        _write_settings(work, extension)
+        _write_settings(work)
         command = [sys.executable, "-m", "jupyterlite_core", "build"]
         done = subprocess.run(command, cwd=work, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(f"JupyterLite could not be built:\n{done.stdout}{done.stderr}")
+        # Fonts for browsers that are older than WebAssembly.
+        for pattern in OLD_FONTS:
+            for path in (work / "out/build").glob(pattern):
+                path.unlink()
         shutil.copytree(work / "out", out, dirs_exist_ok=True)
 
 
-def _write_settings(work: Path, extension: Path) -> None:
+def _write_settings(work: Path) -> None:
     """Write what JupyterLite reads: how to build, and how its kernel starts."""
     build = {
         "apps": ["lab"],
         "contents": [f"{name}.ipynb" for name in names()],
-        "federated_extensions": [str(extension)],
+        "federated_extensions": [str(EXTENSION)],
         "ignore_sys_prefix": True,
         "no_sourcemaps": True,
         "no_unused_shared_packages": True,
@@ -115,19 +124,40 @@ def adapted(notebook: dict[str, Any], name: str) -> dict[str, Any]:
 # Packages -----------------------------------------------------------------------------------------
 
 
-def write_pyodide(out: Path, kernel_wheels: Path) -> None:
-    """Write Python for a page: Pyodide, every wheel, and the list by which it finds them."""
-    out.mkdir(parents=True)
+def fetched() -> Path:
+    """Return the folder with the wheels of wheels.txt, which come from the package registry once.
+
+    Raises `SystemExit` if they cannot be had.
+    """
+    wanted = HERE / "wheels.txt"
+    folder = (
+        HERE.parent / ".cache" / f"wheels-{hashlib.sha256(wanted.read_bytes()).hexdigest()[:16]}"
+    )
+    if folder.is_dir():
+        return folder
+    folder.parent.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as fresh:
+        command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps"]
+        command += ["--only-binary", ":all:", "--platform", "any", "--python-version", "3.12"]
+        command += ["--requirement", str(wanted), "--dest", f"{fresh}/wheels"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise SystemExit(f"the wheels of {wanted} could not be had:\n{done.stderr}")
+        with suppress(OSError):  # another process was faster
+            (Path(fresh) / "wheels").rename(folder)
+    return folder
+
+
+def write_pyodide(out: Path) -> None:
+    """Write Python for a page: Pyodide, every wheel, and the list by which it finds them.
+
+    Raises as `fetched`.
+    """
+    shutil.copytree(fetched(), out)
     for name in CORE:
         shutil.copy2(MODULES / "pyodide" / name, out)
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(out)]
-    command += ["--only-binary", ":all:", "--platform", "any", "--python-version", "3.12"]
-    command += ["--requirement", str(HERE / "wheels.txt")]
-    done = subprocess.run(command, check=False)
-    if done.returncode:
-        raise SystemExit("the wheels of web/lite/wheels.txt could not be had: see above")
     for name in KERNEL_WHEELS:
-        (wheel,) = kernel_wheels.glob(f"{name}-*.whl")
+        (wheel,) = (EXTENSION / "static/pypi").glob(f"{name}-*.whl")
         shutil.copy2(wheel, out)
     _write_wheel(out / "fgtutor-0-py3-none-any.whl", _package())
     _write_numpy(out)
@@ -182,12 +212,9 @@ def _write_wheel(path: Path, files: Mapping[str, bytes]) -> None:
     """Write files as a wheel, with the records that say what it is; the same for the same files."""
     name, version, *tag = path.stem.split("-")
     folder = f"{name}-{version}.dist-info"
-    own = {
-        f"{folder}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n".encode(),
-        f"{folder}/WHEEL": f"Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: {'-'.join(tag)}\n".encode(),
-    }
-    whole = dict(files)
-    whole |= {one: text for one, text in own.items() if one not in files or one.endswith("WHEEL")}
+    about = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+    kind = f"Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: {'-'.join(tag)}\n"
+    whole = {f"{folder}/METADATA": about.encode(), **files, f"{folder}/WHEEL": kind.encode()}
     record = f"{folder}/RECORD"
     whole.pop(record, None)
     lines = [f"{one},sha256={_digest(content)},{len(content)}" for one, content in whole.items()]
