@@ -73,6 +73,13 @@ def test_an_exercise_says_what_is_true_in_a_browser(lite):
         lite.adapted({"cells": [], "metadata": {}}, "ex06")
 
 
+def test_every_package_of_the_browsers_python_has_a_licence(lite):
+    rows = importlib.import_module("book.pages").licence_rows(lite.MODULES, lite.fetched())
+    told = [row for row in rows.splitlines() if row.endswith("exercises in the browser |")]
+    assert len(told) == len(list(lite.fetched().glob("*.whl"))) and "|  |" not in "".join(told)
+    assert "| ipython | 9.4.0 | BSD-3-Clause |" in rows and "| pyodide | 0.27.7 | MPL-2.0 |" in rows
+
+
 @pytest.mark.slow
 def test_every_solution_passes_in_the_browsers_python(lite, node, tmp_path, capsys, monkeypatch):
     lite.write_pyodide(tmp_path / "pyodide")
@@ -126,7 +133,7 @@ def test_an_exercise_is_solved_with_the_network_off(lite, page, tmp_path, capsys
         said = page.wait(
             f"{OUTPUTS}.at(-1)?.startsWith('The worked solution opens') && {OUTPUTS}", "verdicts"
         )
-        page.evaluate("document.querySelector('.jp-OutputArea-output').scrollIntoView()")
+        page.evaluate("jupyterapp.shell.currentWidget.content.scrollToItem(3, 'center')")
         page.screenshot(tmp_path / "lite.png")
         assert "ex01.q1 which cell holds a point?: wrong" in said[0]
         assert "Looks like rounding to the nearest" in said[0]

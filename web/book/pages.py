@@ -11,9 +11,9 @@ import re
 import tomllib
 import zipfile
 from collections.abc import Mapping
-from email.message import Message
-from importlib.metadata import PackageMetadata, PackageNotFoundError, distribution
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 
@@ -200,13 +200,13 @@ def licence_rows(modules: Path, wheels: Path | None = None) -> str:
     return "\n".join([*rows, *texts])
 
 
-def _python_row(about: Message | PackageMetadata, what: str) -> str:
+def _python_row(about: Any, what: str) -> str:
     return f"| {about['Name']} | {about['Version']} | {_licence(about)} | {what} |"
 
 
-def _licence(about: Message | PackageMetadata) -> str:
+def _licence(about: Any) -> str:
     """Return the licence in the metadata of a Python package, in few words."""
-    licence = about.get("License-Expression") or about.get("License") or ""
+    licence = str(about.get("License-Expression") or about.get("License") or "")
     kinds = [
         str(one).split(" :: ")[-1]
         for one in about.get_all("Classifier") or ()

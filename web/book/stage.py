@@ -43,8 +43,9 @@ TOO_LARGE = """\
 This exercise needs torch, which does not run in a browser: open `exercises/{name}.ipynb`"""
 WRITE_HERE = """\
 :::{note}
-{where} in JupyterLab (`make lab`), or in one of the other places of
-[where to run it](../running.md). `check` marks each answer at once, and what passes becomes a part of your own planner.
+{where} in JupyterLab (`make lab`), or in one of the other
+places of [where to run it](../running.md). `check` marks each answer at once, and what passes
+becomes a part of your own planner.
 :::
 """
 Draw = Callable[[Mapping[str, Any], Path, str], dict[int, Frames]]

@@ -37,10 +37,10 @@ DROPPED_ENDS = (".a", ".h", ".pyi", ".pyx", ".pxd", ".pyc")
 OLD_FONTS = ("fa-*.eot", "fa-*.svg", "fa-*.ttf", "fa-*.woff")
 TOP = """\
 **In the browser.** Python runs in this page, with numpy and the checks; nothing is sent anywhere.
-It takes some ten seconds to start, longer the first time. Torch, scipy, networkx and matplotlib are not here, and no time
-limit ends a loop that never does: *Kernel*, *Restart Kernel*. The browser keeps your notebook and
-`mine.py` for this address until you clear its data: to save them elsewhere, right-click them in the
-list of files, *Download*."""
+It takes some ten seconds to start, longer the first time. Torch, scipy, networkx and matplotlib are
+not here, and no time limit ends a loop that never does: *Kernel*, *Restart Kernel*. The browser
+keeps your notebook and `mine.py` for this address until you clear its data: to save them elsewhere,
+right-click them in the list of files, *Download*."""
 OWN = """\
 ## Your own planner
 
