@@ -157,10 +157,10 @@ class Quiet(SimpleHTTPRequestHandler):
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[tuple[str, dict[str, int]]]:
+def serving(folder: Path, kind: type[Quiet] = Quiet) -> Iterator[tuple[str, dict[str, int]]]:
     """Serve a folder on loopback; give its address, and the bytes of each file that was sent."""
     sent: dict[str, int] = {}
-    handler = type("Handler", (Quiet,), {"sent": sent})
+    handler = type("Handler", (kind,), {"sent": sent})
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=folder)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}/", sent

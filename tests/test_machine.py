@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import psutil
 import pytest
 
 from fgtutor.errors import TooLargeError
@@ -85,8 +86,8 @@ def test_this_machine_gives_a_core_and_no_more_than_it_has():
     ],
 )
 def test_the_smallest_room_of_memory_decides(tmp_path: Path, monkeypatch, files, left):
-    free = machine.psutil.virtual_memory()._replace(available=int(8e9))
-    monkeypatch.setattr(machine.psutil, "virtual_memory", lambda: free)
+    free = psutil.virtual_memory()._replace(available=int(8e9))
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)

@@ -1,6 +1,7 @@
 """What passes is kept in mine.py and runs on its own; verdicts say what a learner needs."""
 
 import linecache
+import subprocess
 import sys
 from pathlib import Path
 
@@ -308,3 +309,42 @@ def test_integers_are_asked_for_where_they_matter():
     detail = Judge(strict, arguments).judge(reply_of(floats, arguments, 9.0)).detail
     assert "Expected integers, got numbers of type float64" in detail
     assert Judge(strict, arguments).judge(reply_of(strict.truth, arguments, 9.0)).outcome == PASSED
+
+
+# In a browser -----------------------------------------------------------------------------------
+
+
+def test_without_torch_the_planner_says_what_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr(checks, "find_spec", lambda name: None)
+    assert with_mine("ex01") is None
+    assert "needs torch, which is not here" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match="no exercise 'ex99'"):
+        with_mine("ex99")
+
+
+def test_a_browser_without_storage_is_told(folder, monkeypatch):
+    monkeypatch.setattr(sys, "platform", "emscripten")
+    told = "Kept in mine.py until this page closes"
+    assert told in check("ex10.q2", cell(SPL).spl).detail
+    monkeypatch.setattr(mine, "DRIVE", str(folder))
+    assert "Kept in mine.py.\n" in check("ex10.q2", cell(SPL).spl).detail
+
+
+@pytest.mark.parametrize("options", [{"seed": -1}, {"seed": 0.5}, {"cases": 0}, {"cases": True}])
+def test_what_cannot_be_drawn_is_refused(options):
+    (name,) = options
+    with pytest.raises(ConfigError, match=f"^{name}: should be a whole number from "):
+        check("ex10.q2", len, **options)
+
+
+def test_the_checks_load_nothing_that_a_browser_lacks():
+    code = """if True:
+        import sys
+        sys.modules |= dict.fromkeys(["torch", "pydantic", "psutil", "scipy", "matplotlib"])
+        from fgtutor.course.checks import check, progress
+        print(check("ex10.q2", len).outcome, progress())
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.startswith("crashed The course so far: 0 of 59"), done.stdout

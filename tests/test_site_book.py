@@ -58,8 +58,8 @@ def site(web, tmp_path_factory) -> Path:
             exercises=["ex01"],
             frame_cache=folder / "frames",
         )
-    for name in ("planner", "a1"):
-        (folder / name).mkdir()
+    for name in ("planner", "a1", "lite/lab"):
+        (folder / name).mkdir(parents=True)
         (folder / name / "index.html").write_text("<!doctype html><title>live</title>")
     return folder
 
@@ -85,7 +85,9 @@ def test_pages_have_what_the_notebooks_have(site):
     assert 'href="../exercises/ex01.html"' in text and 'href="../docs/notation.html"' in text
     assert "<p>(0.7 / 0.5, 0.2 / 0.5)" in text, "what is folded is read as Markdown"
     assert "mathjax/tex-svg.js" in text
-    assert "NotImplementedError" in texts(site, "exercises/ex01.html")
+    exercise = texts(site, "exercises/ex01.html")
+    assert "NotImplementedError" in exercise
+    assert 'href="../../lite/lab/index.html?path=ex01.ipynb"' in exercise
     assert "never observed" in texts(site, "api/elevation.html")
     assert "elevation_maps" in texts(site, "searchindex.js")
 
@@ -140,9 +142,12 @@ def test_links_are_those_of_the_book(web, text, expected):
         ("a.css", "p { background: url(https://elsewhere.example/x.png) }"),
         ("a.js", "import x from 'https://elsewhere.example/x.js';"),
         ("a.js", "await fetch(`https://elsewhere.example/x`);"),
+        ("a.js", "s = document.createElement('link'); s.href = 'https://elsewhere.example/x.css'"),
     ],
 )
 def test_a_fault_is_found(web, tmp_path, name, text):
+    link = "t=document.createElement('a'),t.href='https://elsewhere.example/words'"
+    (tmp_path / "good.js").write_text(link)
     (tmp_path / "good.html").write_text("<a href='https://arxiv.org/abs/2602.07932'>words</a>")
     assert web.check.faults(tmp_path) == []
     (tmp_path / name).write_text(text)

@@ -1,9 +1,10 @@
 """Build the site: `make site` runs `python web/build.py`, and everything lands in one folder.
 
 Reads the repository and web/node_modules; gives a static folder with a start page, the course as a
-book, the planner's page and the A1's page. It needs no network and no server of its own:
-`python -m http.server --directory site` shows it. What takes minutes (frames of sliders, grounds of
-the A1) is kept in web/.cache until something that goes into it changes.
+book, the planner's page, the A1's page and the exercises in JupyterLite. The site needs no network
+and no server of its own: `python -m http.server --directory site` shows it. What takes minutes
+(frames of sliders, grounds of the A1) is kept in web/.cache until something that goes into it
+changes, and so are the packages for the browser, which come from the registry.
 """
 
 import argparse
@@ -26,7 +27,7 @@ from book import check, frames, pages, stage
 WEB = Path(__file__).resolve().parent
 ROOT = WEB.parent
 CACHE = WEB / ".cache"
-LIVE = ("planner", "a1")
+LIVE = ("planner", "a1", "lite")
 """The pages with something live in them; each has an `export.py`."""
 SOURCES = (".html", ".js", ".css", ".svg")
 """What a page's folder gives the site as it is."""
@@ -40,11 +41,13 @@ def build_book(
     notebooks: list[str] | None = None,
     exercises: list[str] | None = None,
     frame_cache: Path = CACHE / "frames",
+    wheels: Path | None = None,
     strict: bool = True,
 ) -> None:
     """Build the book, or one of some notebooks and exercises; raises `SystemExit` on faults.
 
-    `scratch` is a folder for its sources and what Sphinx reads of them.
+    `scratch` is a folder for its sources and what Sphinx reads of them, `wheels` the one with the
+    packages of the browser's Python, whose licences the book tells.
     """
     from sphinx.cmd.build import main as sphinx
 
@@ -60,7 +63,7 @@ def build_book(
         draw=lambda content, where, _: frames.frames_of(content, where, frame_cache),
         notebooks=notebooks,
         exercises=exercises,
-        licences=pages.licence_rows(WEB / "node_modules"),
+        licences=pages.licence_rows(WEB / "node_modules", wheels),
     )
     (sources / "_static/mathjax").mkdir(exist_ok=True)
     shutil.copy2(WEB / "node_modules/mathjax/es5/tex-svg.js", sources / "_static/mathjax")
@@ -122,7 +125,11 @@ def _sources_hash(name: str) -> str:
         for path in sorted(folder.rglob(f"*{suffix}")):
             if path.is_file() and path.suffix != ".pyc":
                 digest.update(path.read_bytes())
-    for path in (WEB / "exports.py", WEB / "package.json"):
+    more = [WEB / "exports.py", WEB / "package.json"]
+    if name == "lite":
+        more += [*sorted((ROOT / "exercises").glob("*.ipynb")), ROOT / "constraints.txt"]
+        more += [ROOT / "fgtutor/course/checks/solutions.json", WEB / "book/stage.py"]
+    for path in more:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -149,16 +156,16 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     for part in parts:
         shutil.rmtree(out / part, ignore_errors=True)
-    if "book" in parts:
-        print("drawing the frames of the sliders", flush=True)
-        draw_frames(options.jobs)
-        print("building the book", flush=True)
-        build_book(out / "book", CACHE / "book")
     for name in LIVE:
         if name in parts:
             print(f"exporting {name}", flush=True)
             with contextlib.chdir(ROOT):
                 export_page(name, out / name)
+    if "book" in parts:
+        print("drawing the frames of the sliders", flush=True)
+        draw_frames(options.jobs)
+        print("building the book", flush=True)
+        build_book(out / "book", CACHE / "book", wheels=out / "lite/static/pyodide")
     shutil.copytree(WEB / "js", out / "js", dirs_exist_ok=True)
     for name in ("index.html", "start.css", "style.css"):
         shutil.copy2(WEB / name, out / name)

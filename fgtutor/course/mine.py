@@ -9,6 +9,7 @@ import ast
 import hashlib
 import os
 import re
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ Written by `check`, a section per question: change a function in your notebook a
 """How the file begins."""
 SECTION = re.compile(r"^# %% (ex\d\d\.q\d+)(?: ([0-9a-f]{8}))?$", re.MULTILINE)
 """The line before a section: its question, and a checksum of what follows."""
+DRIVE = "/drive"
+"""Where JupyterLite shows Python the files that the browser keeps."""
 LARGEST = 1_000_000
 """Characters of a file that is read; a whole course takes thirty thousand."""
 
@@ -113,6 +116,14 @@ def reset(question: str = "", folder: Path | None = None) -> str:
     del kept[question]
     _write(path, kept)
     return f"{question} is no longer in {FILE}"
+
+
+def lasts() -> bool:
+    """Return whether a file in the working folder outlives this process; in a browser it may not.
+
+    JupyterLite has its lasting files under `DRIVE`, unless the browser allows no service worker.
+    """
+    return sys.platform != "emscripten" or Path.cwd().is_relative_to(DRIVE)
 
 
 def load(folder: Path | None = None) -> dict[str, dict[str, Any]]:

@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import psutil
-
 from fgtutor.errors import TooLargeError
 
 ALWAYS_LEFT = 2**28
@@ -50,6 +48,8 @@ def available_memory(root: Path = Path("/")) -> int:
 
     `root` is where the kernel's files are found, for tests.
     """
+    import psutil  # here: a browser has none, nor asks
+
     rooms = [psutil.virtual_memory().available]
     rooms += [room for group in _groups(root, "memory") for room in _room(group)]
     with suppress(ImportError):  # Windows has no such limits

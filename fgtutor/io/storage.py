@@ -17,8 +17,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from fgtutor.errors import StorageError
 
 LOCK = ".lock"
@@ -107,9 +105,18 @@ def remove_leftovers(target: Path) -> None:
     start = f".fgtutor-{_key(target)}-"
     for path in target.parent.glob(f"{start}*"):
         writer = path.name.removeprefix(start).split("-")[0]
-        if writer.isdecimal() and int(writer) not in psutil.pids():
+        if writer.isdecimal() and int(writer) not in _processes():
             with suppress(OSError):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def _processes() -> list[int]:
+    """Return the ids of what runs on this computer; in a browser Python sees itself alone."""
+    if sys.platform == "emscripten":
+        return [os.getpid()]
+    import psutil  # here: there is none for a browser
+
+    return psutil.pids()
 
 
 def beside(path: Path, suffix: str = "") -> Path:

@@ -4,13 +4,16 @@ Reads the modules' docstrings through Sphinx, README's sentence on what needs wh
 installed; gives Markdown by page.
 """
 
+import email
 import itertools
 import json
 import re
 import tomllib
+import zipfile
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 
@@ -27,6 +30,12 @@ PAPER = "api/paper"
 OUR_CODE = (
     ("fgtutor", "MIT", "the library, the course, these pages"),
     ("Munk2D (Chipmunk)", "MIT", "the toy's physics, from pymunk's source, as WebAssembly"),
+    (
+        "numpy, as WebAssembly",
+        "BSD-3-Clause",
+        "for the exercises in the browser, by emscripten-forge",
+    ),
+    ("CPython", "PSF-2.0", "Python itself, within Pyodide"),
     ("Model of the Unitree A1", "BSD-3-Clause", "numbers of the robot, from MuJoCo Menagerie"),
 )
 
@@ -163,8 +172,11 @@ def licence_page(rows: str) -> str:
     )
 
 
-def licence_rows(modules: Path) -> str:
-    """Return a row for each npm package and each Python package of the book, then the texts."""
+def licence_rows(modules: Path, wheels: Path | None = None) -> str:
+    """Return a row for each npm package and each Python package of the book, then the texts.
+
+    Packages of the browser's Python come from the folder `wheels`.
+    """
     rows = []
     for path in sorted(modules.glob("*/package.json")) + sorted(modules.glob("@*/*/package.json")):
         about = json.loads(path.read_text(encoding="utf-8"))
@@ -174,21 +186,33 @@ def licence_rows(modules: Path) -> str:
             about = distribution(name).metadata
         except PackageNotFoundError:
             continue
-        licence = about.get("License-Expression") or about.get("License") or ""
-        kinds = [
-            one.split(" :: ")[-1]
-            for one in about.get_all("Classifier") or ()
-            if "License ::" in one
-        ]
-        licence = licence if licence and len(licence) < 40 else ", ".join(kinds)
-        rows.append(
-            f"| {about['Name']} | {about['Version']} | {licence} | Python, builds these pages |"
-        )
+        rows.append(_python_row(about, "Python, builds these pages"))
+    for path in sorted(wheels.glob("*.whl") if wheels else ()):
+        with zipfile.ZipFile(path) as packed:
+            (name,) = (n for n in packed.namelist() if n.endswith(".dist-info/METADATA"))
+            about = email.message_from_bytes(packed.read(name))
+        if _licence(about):  # the package's own, and those that stand for what is absent, have none
+            rows.append(_python_row(about, "Python, for the exercises in the browser"))
     texts = [
         f"\n## {path.parent.relative_to(modules)}\n\n```text\n{path.read_text('utf-8')}\n```"
         for path in sorted(modules.rglob("LICENSE*"))
     ]
     return "\n".join([*rows, *texts])
+
+
+def _python_row(about: Any, what: str) -> str:
+    return f"| {about['Name']} | {about['Version']} | {_licence(about)} | {what} |"
+
+
+def _licence(about: Any) -> str:
+    """Return the licence in the metadata of a Python package, in few words."""
+    licence = str(about.get("License-Expression") or about.get("License") or "")
+    kinds = [
+        str(one).split(" :: ")[-1]
+        for one in about.get_all("Classifier") or ()
+        if "License ::" in str(one)
+    ]
+    return licence if licence and len(licence) < 40 else ", ".join(kinds)
 
 
 def _book_packages() -> list[str]:

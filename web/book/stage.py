@@ -34,11 +34,18 @@ LIVE = {
                      "planner's page</a> taus, f_min, costs, policies and goal move freely."),
 }  # fmt: skip
 """Widgets that need more than pictures: the page that has them live, and what to say of it."""
+NEEDS_TORCH = ("ex03", "ex13")
+"""Exercises that cannot run in a browser."""
+TRY_IT = """\
+Try it in the browser: <a href="../../lite/lab/index.html?path={name}.ipynb">open this exercise in
+JupyterLite</a>, with nothing to install. Or open `exercises/{name}.ipynb`"""
+TOO_LARGE = """\
+This exercise needs torch, which does not run in a browser: open `exercises/{name}.ipynb`"""
 WRITE_HERE = """\
 :::{note}
-You can read this exercise here; to work on it, open `{name}` in JupyterLab (`make lab`), or
-in one of the other places of [where to run it](../running.md). `check` marks each
-answer at once, and what passes becomes a part of your own planner.
+{where} in JupyterLab (`make lab`), or in one of the other
+places of [where to run it](../running.md). `check` marks each answer at once, and what passes
+becomes a part of your own planner.
 :::
 """
 Draw = Callable[[Mapping[str, Any], Path, str], dict[int, Frames]]
@@ -92,7 +99,8 @@ def stage(
         _write(out / f"notebooks/{name}.ipynb", lesson(content, name, pages, frames))
     for name in questions:
         content = json.loads(_read(f"exercises/{name}.ipynb"))
-        note = WRITE_HERE.replace("{name}", f"exercises/{name}.ipynb")
+        where = TOO_LARGE if name in NEEDS_TORCH else TRY_IT
+        note = WRITE_HERE.replace("{where}", where).replace("{name}", name)
         _write(out / f"exercises/{name}.ipynb", lesson(content, name, pages, {}, note=note))
     return pages
 

@@ -15,6 +15,7 @@ import sys
 from collections import namedtuple
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -69,7 +70,7 @@ def check(question: str, answer: Any, *, seed: int = 0, cases: int = CASES) -> V
     asked = find(question)
     arguments = asked.cases(seed, cases)
     judge = Judge(asked, arguments, tell=question in _tried)
-    verdict = judge.judge(_asked(asked, answer, arguments))
+    verdict = judge.judge_own(_asked(asked, answer, arguments))
     if verdict.outcome != NOT_STARTED:
         _tried.add(question)
     if verdict.outcome != PASSED:
@@ -151,9 +152,15 @@ def with_mine(exercise: str) -> "Figure | None":
     """Run the planner with the learner's functions in place of the library's, and draw it.
 
     `exercise`, such as "ex04", says which part of it is shown. Raises `ConfigError` for another
-    name, and what `mine.read` raises.
+    name, and what `mine.read` raises. Without torch, as in a browser, it says what is missing.
     """
     questions_of(exercise)
+    if find_spec("torch") is None:
+        print(
+            "The planner with your functions in it needs torch, which is not here: take mine.py "
+            "to where fgtutor is installed (`make lab`) and run this cell there."
+        )
+        return None
     from fgtutor.course.pipeline import show
 
     functions, faults = {}, []
@@ -206,12 +213,14 @@ def _keep(judge: Judge, answer: Any) -> str:
     try:
         source = source_of(asked.name, answer)
         alone = mine.run(source)[asked.name]
-        verdict = judge.judge(_asked(asked, alone, copy.deepcopy(judge.cases)))
+        verdict = judge.judge_own(_asked(asked, alone, copy.deepcopy(judge.cases)))
         if verdict.outcome != PASSED:
             raise ConfigError(f"taken out of the notebook it does not pass: {verdict.detail}")
         mine.keep(asked.id, source)
     except (ConfigError, StorageError) as error:
         return f"It could not be kept in mine.py: {error}."
+    if not mine.lasts():
+        return "Kept in mine.py until this page closes: the browser gives it no lasting storage."
     return "Kept in mine.py."
 
 

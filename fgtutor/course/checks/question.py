@@ -8,6 +8,7 @@ function itself: an answer with the same results has made it.
 import copy
 import html
 import inspect
+import json
 import textwrap
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +27,6 @@ from fgtutor.course.grading.answers import (
 )
 from fgtutor.course.grading.replies import CRASHED, NOT_STARTED, TOO_SLOW
 from fgtutor.errors import ConfigError
-from fgtutor.io.validation import CountOrZero, Seed, check_arguments, parse_record
 
 PASSED, WRONG = "passed", "wrong"
 OUTCOMES: tuple[str, ...] = (PASSED, NOT_STARTED, WRONG, CRASHED, TOO_SLOW)
@@ -42,7 +42,9 @@ LONGEST = 5000
 """Most characters of a text that is shown; no path is longer."""
 CASES = 10
 """Drawn cases of a question, unless the instructor wants more."""
-Cases = Annotated[int, Interval(ge=1, le=10_000)]
+DRAWN = 1, 10_000
+"""Fewest and most cases that may be asked for."""
+Cases = Annotated[int, Interval(ge=DRAWN[0], le=DRAWN[1])]
 """How many cases are drawn; with none, any answer would be right."""
 
 
@@ -137,13 +139,18 @@ class Question:
             function = self.harness or target
             return [arrays_of(function(*called, *copy.deepcopy(case))) for case in cases]
 
-    def cases(self, seed: Seed = 0, cases: Cases = CASES) -> list[tuple] | None:
+    def cases(self, seed: int = 0, cases: int = CASES) -> list[tuple] | None:
         """Return the arguments of every case; the same for one seed. None for a number to find.
 
         Raises:
             ConfigError: Nothing, or more than makes sense, would be drawn, or the seed is none.
         """
-        check_arguments(Question.cases, locals(), ConfigError)
+        for name, value, least, most in (("seed", seed, 0, 2**32 - 1), ("cases", cases, *DRAWN)):
+            whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+            if not whole or not least <= value <= most:
+                raise ConfigError(
+                    f"{name}: should be a whole number from {least} to {most}, got {value!r:.60}"
+                )
         if self.draw is None:
             return None
         rng = np.random.default_rng((seed, zlib.crc32(self.id.encode())))
@@ -161,7 +168,7 @@ class Reply:
     """Why there are no answers."""
     detail: str = ""
     """The same in words."""
-    changed: CountOrZero | None = None
+    changed: Annotated[int, Interval(ge=0)] | None = None
     """Which of its arguments the function changed."""
     answers: list[Any] | None = None
     """An encoded answer to every case."""
@@ -225,12 +232,29 @@ class Judge:
         self._wrong_answers: dict[str, list[Any] | None] = {}
 
     def judge(self, reply: Mapping[str, Any]) -> Verdict:
-        """Turn a reply of `replies.reply_of`, which may be forged or broken, into a verdict."""
+        """Turn a submission's reply, which may be forged or broken, into a verdict."""
+        # Imported here: no browser has pydantic, and none judges what others send.
+        from fgtutor.io.validation import parse_record
+
         try:
             said = parse_record(Reply, reply, ConfigError, "the reply")
+        except ConfigError as error:
+            return self._unreadable(error)
+        return self._judge(said)
+
+    def judge_own(self, reply: Mapping[str, Any]) -> Verdict:
+        """Turn a reply that this process got from `replies.reply_of` into a verdict."""
+        # As JSON it holds plain values alone, as it would from another process.
+        return self._judge(Reply(**json.loads(json.dumps(reply))))
+
+    def _unreadable(self, error: ConfigError) -> Verdict:
+        return Verdict(self.question, CRASHED, plain_text(f"unreadable answer: {error}"))
+
+    def _judge(self, said: Reply) -> Verdict:
+        try:
             answers = [decode(answer) for answer in said.answers or []]
         except ConfigError as error:
-            return Verdict(self.question, CRASHED, plain_text(f"unreadable answer: {error}"))
+            return self._unreadable(error)
         if said.outcome:
             return Verdict(self.question, said.outcome, plain_text(said.detail))
         if said.changed is not None:

@@ -38,7 +38,8 @@ def time_limit(seconds: float, patience: float = PATIENCE) -> Iterator[None]:
     """Raise `TooSlow` in the block after `seconds` of CPU time, or `patience` times that by clock.
 
     With patience 0 the clock does not count: the grader watches whether the process sleeps. Where
-    there are no such timers (Windows, threads) there is no limit: interrupt the kernel.
+    there are no such timers (Windows, threads, a browser) there is no limit: interrupt the
+    kernel, or in a browser restart it.
     """
     in_main = threading.current_thread() is threading.main_thread()
     if not (in_main and hasattr(signal, "setitimer")):
