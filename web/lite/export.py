@@ -30,6 +30,8 @@ CORE = ("pyodide.js", "pyodide.mjs", "pyodide.asm.js", "pyodide.asm.wasm", "pyth
 """What there is of Pyodide's own: `.mjs` is for the test in Node."""
 ABSENT = ("ssl", "sqlite3", "jedi")
 """What JupyterLite's kernel asks for by name and does without: an empty wheel answers it."""
+ON_DEMAND = ("networkx",)
+"""What is loaded when a cell imports it: no exercise needs it."""
 KERNEL_WHEELS = ("piplite", "pyodide_kernel", "ipykernel")
 DROPPED = ("tests", "f2py", "_pyinstaller", "include")
 """Folders of numpy that no exercise needs."""
@@ -37,10 +39,10 @@ DROPPED_ENDS = (".a", ".h", ".pyi", ".pyx", ".pxd", ".pyc")
 OLD_FONTS = ("fa-*.eot", "fa-*.svg", "fa-*.ttf", "fa-*.woff")
 TOP = """\
 **In the browser.** Python runs in this page, with numpy and the checks; nothing is sent anywhere.
-It takes some ten seconds to start, longer the first time. Torch, scipy, networkx and matplotlib are
-not here, and no time limit ends a loop that never does: *Kernel*, *Restart Kernel*. The browser
-keeps your notebook and `mine.py` for this address until you clear its data: to save them elsewhere,
-right-click them in the list of files, *Download*."""
+It takes half a minute to start, longer the first time. Networkx is here too; torch, scipy and
+matplotlib are not, and no time limit ends a loop that never does: *Kernel*, *Restart Kernel*. The
+browser keeps your notebook and `mine.py` for this address until you clear its data: to save them
+elsewhere, right-click them in the list of files, *Download*."""
 OWN = """\
 ## Your own planner
 
@@ -96,7 +98,11 @@ def _write_settings(work: Path) -> None:
     }
     lock = json.loads((work / "static/pyodide/pyodide-lock.json").read_text(encoding="utf-8"))
     # The kernel installs what is not in this list, and compares names as its wheels spell them.
-    packages = [one["file_name"].split("-")[0] for one in lock["packages"].values()]
+    packages = [
+        one["file_name"].split("-")[0]
+        for name, one in lock["packages"].items()
+        if name not in ON_DEMAND
+    ]
     options = {"packages": packages}
     kernel = {"disablePyPIFallback": True, "loadPyodideOptions": options}
     page = {"appName": "fgtutor", "litePluginSettings": {f"{KERNEL}:kernel": kernel}}
@@ -179,7 +185,7 @@ def _entry(wheel: Path) -> tuple[str, dict[str, Any]]:
         "install_dir": "site",
         "sha256": hashlib.sha256(wheel.read_bytes()).hexdigest(),
         "package_type": "package",
-        "imports": [],
+        "imports": [name] if name in ON_DEMAND else [],
         "depends": [],
         "unvendored_tests": False,
     }
