@@ -61,6 +61,9 @@ class FollowConfig:
     """Standard deviation of each localisation fix, m."""
     drift: Magnitude = 0.0
     """Growth of the localisation error, m per square root of a second (a random walk)."""
+    fusing_seconds: Factor = 0.0
+    """Time over which fixes are averaged, s; in between, the robot knows how far it has moved, here
+    without error (on a robot, by odometry). 0: each fix is believed as it comes."""
     displaced_scan: bool = False
     """Let the error of a fix displace what the policy sees too, as where a robot looks its heights
     up in a map; if not, only the follower is misled."""
@@ -225,7 +228,7 @@ class _Drive:
             ]
         )
         n = len(tracks)
-        self.error = np.zeros((n, 2))
+        self.error, self.believed_error = np.zeros((2, n, 2))
         self.active = np.array([track.policy for track in self.tracks])
         self.waiting = np.zeros(n, dtype=int)
         starts = [
@@ -298,7 +301,11 @@ class _Drive:
         if config.drift or config.position_noise:
             fixes = np.array([rng.standard_normal((2, 2)) for rng in self.rngs])
             self.error += config.drift * math.sqrt(self.env.control_dt) * fixes[:, 0]
-            believed = pose[:, :2] + self.error + config.position_noise * fixes[:, 1]
+            wrong = self.error + config.position_noise * fixes[:, 1]
+            # A first-order filter over where the fixes say that it is, moved along with the robot.
+            share = self.env.control_dt / max(config.fusing_seconds, self.env.control_dt)
+            self.believed_error += share * (wrong - self.believed_error)
+            believed = pose[:, :2] + self.believed_error
         else:
             believed = pose[:, :2]
         if config.displaced_scan:

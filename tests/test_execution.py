@@ -319,6 +319,28 @@ def test_a_wrong_fix_moves_what_is_seen_if_asked(make_rolling, monkeypatch, disp
 
 
 @pytest.mark.slow
+def test_fused_fixes_are_wrong_by_less_but_keep_their_drift(make_rolling, monkeypatch):
+    terrain = make_terrain("rubble", difficulty=0.3, seed=1)
+    route = straight(terrain.elevation, terrain.start, (4.0, terrain.start[1]))
+    look, errors = ToyEnv.patches, []
+    monkeypatch.setattr(
+        ToyEnv, "patches", lambda env: (errors.append(env.displacement.clone()), look(env))[1]
+    )
+
+    def spread(**options) -> float:
+        errors.clear()
+        config = FollowConfig(displaced_scan=True, **options)
+        execute(route, terrain, {"roll": make_rolling()}, config=config)
+        return float(torch.cat(errors[25:]).square().mean().sqrt())
+
+    # A first-order filter with share a leaves sqrt(a / (2 - a)) of white noise: 0.04 s of 0.4 s.
+    fused = spread(position_noise=0.05, fusing_seconds=0.4)
+    assert fused == pytest.approx(0.05 * (0.1 / 1.9) ** 0.5, rel=0.35)
+    assert spread(position_noise=0.05, fusing_seconds=0.04) == spread(position_noise=0.05)
+    assert spread(drift=0.05, fusing_seconds=0.4) == pytest.approx(spread(drift=0.05), rel=0.35)
+
+
+@pytest.mark.slow
 def test_a_condition_makes_another_robot(make_rolling):
     route, terrain = task((1.0, 2.0), (4.5, 2.0), np.zeros((60, 40)))
     run = {"zoo": {"roll": make_rolling()}, "seeds": [3]}

@@ -75,6 +75,8 @@ class SwitchingConfig(DisturbedConfig):
     misled: Annotated[tuple[Literal["follower", "scan"], ...], MinLen(1), Unique] = ("follower",)
     """What the errors of a fix mislead: the follower alone; or the scan as well, the heights around
     it that a policy sees, as where a robot looks them up in a map. Both: one after the other."""
+    fusing_seconds: Annotated[float, Interval(ge=0, le=60)] = 0.0
+    """Time over which the robot averages its fixes, moved along with it, s; 0: it believes each."""
     courses: Annotated[tuple[str, ...], Unique] = ()
     """Only these courses, such as steps-gaps; default: every pair of neighbours, and full."""
     planners: Annotated[tuple[str, ...], Unique] = ()
@@ -228,6 +230,7 @@ def run_task(config: SwitchingConfig, course: str, indices: Sequence[int]) -> li
                 hold_steps=settings.hold_steps,
                 position_noise=noise,
                 drift=drift,
+                fusing_seconds=config.fusing_seconds,
                 displaced_scan=misled == "scan",
             )
             rows += (
@@ -322,14 +325,16 @@ def run(config: SwitchingConfig) -> int:
         return replace(driven, seconds=driven.seconds + scanned)
 
     def find(trials: list[SwitchingRow]) -> Findings:
+        fused = config.fusing_seconds
+        averaged = f", averaged over {fused:g} s along the robot's motion," if fused else ""
         return Findings(
             table=table(trials),
             caption=(
                 f"Success in % with 95 % intervals, {config.trials:,} trials per cell; fixes with "
-                "a standard deviation of noise (cm) and a drift (cm per root second) mislead the "
-                "follower, or displace the scan that policies see as well; maps to plan on from a "
-                f"simulated scan; robot {config.robot}, {config.planning}, seed {config.seed}; "
-                f"{config.told(config.condition)}, but for the fix."
+                f"a standard deviation of noise (cm) and a drift (cm per root second){averaged} "
+                "mislead the follower, or displace the scan that policies see as well; maps to "
+                f"plan on from a simulated scan; robot {config.robot}, {config.planning}, seed "
+                f"{config.seed}; {config.told(config.condition)}, but for the fix."
             ),
             figures=charts(trials),
         )
