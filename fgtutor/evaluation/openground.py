@@ -272,6 +272,7 @@ def picture(config: OpenGroundConfig, index: int, rows: Sequence[OpenRow]) -> Dr
             f"Map {index} ({ground.group}): {reached.successes} of {reached.trials} feasible tasks "
             "reached; dotted: refused",
             fontsize=9,
+            loc="left",
         )
         figure.savefig(path)
 
