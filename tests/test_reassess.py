@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from fgtutor import tiles
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
+from fgtutor.feasibility import FoldedNet
 from fgtutor.patches import PatchGrid
 from fgtutor.tensorization import Assessment, assess, assess_all, reassess
 
@@ -90,11 +91,11 @@ def test_a_dot_costs_a_thirtieth_of_a_map_of_400_cells(make_specialist, monkeypa
     blank = {name: torch.zeros(400, 400, 8) for name in numbers}
     before = {"a": replace(small, elevation=elevation, **blank)}
     assessed = []
-    plain = specialist.feasibility.feasibility
+    plain = FoldedNet.feasibility
     monkeypatch.setattr(
-        specialist.feasibility,
+        FoldedNet,
         "feasibility",
-        lambda patch, command: (assessed.append(len(patch)), plain(patch, command))[1],
+        lambda net, patch: (assessed.append(len(patch)), plain(net, patch))[1],
     )
     # In the middle of a tile, on a corner where four meet, and at the map's own corner.
     for cell in ((204, 204), (192, 192), (399, 0)):
@@ -110,7 +111,7 @@ def test_a_map_that_did_not_change_costs_nothing(make_specialist, monkeypatch):
     elevation = rough(12, 9, np.random.default_rng(0))
     specialist = make_specialist("a")
     before = assess_all(elevation, {"a": specialist})
-    monkeypatch.setattr(specialist.feasibility, "feasibility", None)  # would raise if called
+    monkeypatch.setattr(FoldedNet, "feasibility", None)  # would raise if called
     said, seen = reassess(before, elevation)
     assert torch.equal(said["a"].f, before["a"].f) and not seen.any()
 
