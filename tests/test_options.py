@@ -17,7 +17,7 @@ from fgtutor.robots.a1.randomise import A1EnvConfig
 from fgtutor.robots.a1.rewards import RewardWeights
 from fgtutor.robots.crossings import EnvConfig
 from fgtutor.robots.lidar import LidarConfig
-from fgtutor.robots.toy import ToyModel
+from fgtutor.robots.toy import ToyModel, ToySpread
 from fgtutor.world.obstacles import TerrainScale
 from fgtutor.world.scanning import ScanConfig
 
@@ -39,7 +39,7 @@ SENSE = {
     "clearance": (*HUGE, math.inf),
     **dict.fromkeys(("critic_warmup", "difficulty"), ZERO),
     **dict.fromkeys(("easiest", "easiest_at_last", "entropy", "f_min", "gamma", "heights"), ZERO),
-    **dict.fromkeys(("label_seconds", "levels", "neighbours", "seed"), ZERO),
+    **dict.fromkeys(("fusing_seconds", "label_seconds", "levels", "neighbours", "seed"), ZERO),
     **dict.fromkeys(("seeds", "workers", "turned", "updates"), ZERO),
     "angles": ZERO + BELOW,
 }
@@ -106,7 +106,7 @@ INNER = [
     (kind, name, hint)
     for kind in (
         *(A1Config, A1EnvConfig, EnvConfig, FollowConfig, LidarConfig, OccupancyConfig),
-        *(RewardWeights, ScanConfig, TerrainScale, ToyModel, TraversabilityConfig),
+        *(RewardWeights, ScanConfig, TerrainScale, ToyModel, ToySpread, TraversabilityConfig),
     )
     for name, hint in get_type_hints(kind, include_extras=True).items()
     if with_value(hint, 1) is not None
