@@ -25,7 +25,7 @@ from fgtutor import patches
 from fgtutor.directions import HeadingCount, Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, ThresholdError
-from fgtutor.feasibility import TAU_HIGH, TAU_LOW, OodScore, ood_weight
+from fgtutor.feasibility import TAU_HIGH, TAU_LOW, FoldedNet, OodScore, ood_weight
 from fgtutor.grid import point_text
 from fgtutor.io.machine import require_memory
 from fgtutor.io.progress import watch
@@ -275,25 +275,27 @@ def _assess_tiles(
         for grid, some in tiles.items()
         for one in WAYS[method](heights, yaws, grid, resolution, some)
     )
+    nets = {
+        name: one.feasibility.folded(torch.tensor(one.command, dtype=torch.float32))
+        for name, one in zoo.items()
+    }
     total = sum(map(len, tiles.values()))
     shown = watch(cut, total, work or "", show=work is not None, unit="tile")
     for grid, (rows, columns), patch in shown:
         shape = len(yaws), rows.stop - rows.start, columns.stop - columns.start
         distinct, which = distinct_patches(patch.flatten(0, 1))
         team = {name: specialist for name, specialist in zoo.items() if specialist.grid == grid}
-        for name, found in _ask(team, distinct).items():
+        for name, found in _ask(team, nets, distinct).items():
             for values, whole in zip(found, assessments[name].said.values(), strict=True):
                 whole[rows, columns] = values[which].reshape(shape).movedim(0, -1)
 
 
 def _ask(
-    team: Mapping[str, Specialist], patch: Float[Tensor, "n points"]
+    team: Mapping[str, Specialist],
+    nets: Mapping[str, FoldedNet],
+    patch: Float[Tensor, "n points"],
 ) -> dict[str, Float[Tensor, "3 n"]]:
-    """Return f, L_recon and the strangeness of patches, by each specialist."""
-    nets = {
-        name: one.feasibility.folded(torch.tensor(one.command, dtype=torch.float32))
-        for name, one in team.items()
-    }
+    """Return f, L_recon and the strangeness of patches, by each specialist's folded net."""
     found = {name: torch.empty(3, len(patch)) for name in team}
     for first in range(0, len(patch), CACHED):
         part = patch[first : first + CACHED]
