@@ -9,7 +9,7 @@ legged robots in challenging terrain", 2016) for the traversability and the valu
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any
 
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from fgtutor.directions import HeadingCount, Headings
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError
+from fgtutor.errors import ConfigError, UnknownCellError
 from fgtutor.fusion import fuse
 from fgtutor.io.validation import Count, Positive, check_fields
 from fgtutor.planning import Point, plan_on_map
@@ -175,6 +175,13 @@ class AssessedMap:
     headings: HeadingCount = HEADINGS
     """The number of headings that cells can be left along."""
     _known: dict[str, Assessment] = field(default_factory=dict)
+    _along: dict[HeadingCount, "AssessedMap"] = field(default_factory=dict)
+
+    def along(self, headings: HeadingCount) -> "AssessedMap":
+        """Return the same map along another number of headings."""
+        if headings not in self._along:
+            self._along[headings] = AssessedMap(self.elevation, self.zoo, self.taus, headings)
+        return self._along[headings]
 
     @property
     def specialists(self) -> list[str]:
@@ -242,26 +249,34 @@ def without_fusion(ground: AssessedMap) -> Sequence[Layers]:
     return [{name: tensor} for name, tensor in ground.tensors().items()]
 
 
-def classical(cells: Cells, ground: AssessedMap) -> Sequence[Layers]:
-    """Plan on a classical map, which knows of no policies; the generalist drives."""
-    values = torch.from_numpy(cells(ground.elevation, ground.radius))
-    return [{GENERAL: _all_headings(values, ground)}]
-
-
 @dataclass(frozen=True)
-class Switched:
-    """Plan on a classical map; our policy map P says which specialist drives.
+class Classical:
+    """Plan on a classical map, which knows of no policies; the generalist drives.
 
-    The map knows of no policies, so a change of them costs its search nothing, and each step has
-    one driver only (see `find_route`).
+    Its F is a cost in disguise, so its routes promise nothing (see `find_route`).
     """
 
     cells: Cells
 
     def __call__(self, ground: AssessedMap) -> Sequence[Layers]:
-        """Return the layers: each step stands in that of its driver."""
+        """Return the one layer, that of the generalist."""
+        return [{GENERAL: self.layer(ground)}]
+
+    def layer(self, ground: AssessedMap) -> Float[Tensor, "nx ny d"]:
+        """Return what the map says of every step."""
         values = torch.from_numpy(self.cells(ground.elevation, ground.radius))
-        layer, tensors = _all_headings(values, ground), ground.tensors()
+        return _all_headings(values, ground)
+
+
+class Switched(Classical):
+    """Plan on a classical map; our policy map P says which specialist drives.
+
+    A change of policies costs its search nothing, and each step has one driver only.
+    """
+
+    def __call__(self, ground: AssessedMap) -> Sequence[Layers]:
+        """Return the layers: each step stands in that of its driver."""
+        layer, tensors = self.layer(ground), ground.tensors()
         _, policy_map = fuse(list(tensors.values()))
         return [{name: layer * (policy_map == i) for i, name in enumerate(tensors)}]
 
@@ -284,9 +299,9 @@ def planners(zoo: Mapping[str, Specialist]) -> dict[str, Planner]:
         "no-ood": without_ood,
         "no-heading": without_heading,
         "no-fusion": without_fusion,
-        **({"traversability": partial(classical, traversability)} if generalist else {}),
+        **({"traversability": Classical(traversability)} if generalist else {}),
         "traversability+P": Switched(traversability),
-        **({"occupancy": partial(classical, occupancy)} if generalist else {}),
+        **({"occupancy": Classical(occupancy)} if generalist else {}),
         "occupancy+P": Switched(occupancy),
     }
 
@@ -302,17 +317,26 @@ def find_route(
     """Return the planner's cheapest route, whose `names` are the policies that may drive it.
 
     `settings` and `changes` are those of `planning.plan`, but for the thresholds and headings,
-    which are the map's; where P names the drivers (`Switched`), changes of policy are free. Raises
-    `ConfigError` if the planner offers no layers.
+    which are the map's; `finer_headings` are tried where those find no route, if they are more.
+    On classical maps every route will do, and where P names the drivers (`Switched`), changes of
+    policy are free. Raises `ConfigError` if the planner offers no layers.
     """
+    settings = replace(settings or PlanSettings(), **changes | {"headings": ground.headings})
+    if isinstance(planner, Classical):
+        settings = replace(settings, least_promise=0.0)
     if isinstance(planner, Switched):
-        changes["switch_cost"] = 0.0
+        settings = replace(settings, switch_cost=0.0)
     answers = []
     for layers in planner(ground):
         team = {name: ground.zoo[name] for name in layers}
-        options = {"settings": settings, "tensors": layers, **changes, "headings": ground.headings}
+        options = {"settings": settings, "tensors": layers}
         answers.append(plan_on_map(ground.elevation, team, start, goal, **options).answer)
     if not answers:
         raise ConfigError("this planner has no policy to plan for: the zoo is empty")
     routes = [answer for answer in answers if isinstance(answer, Route)]
-    return min(routes, key=lambda route: route.cost, default=answers[-1])
+    refusal = answers[-1]
+    if routes or isinstance(refusal.error, UnknownCellError):
+        return min(routes, key=lambda route: route.cost, default=refusal)
+    if settings.finer_headings <= ground.headings:
+        return refusal
+    return find_route(planner, ground.along(settings.finer_headings), start, goal, settings)

@@ -65,6 +65,10 @@ class UnreachableError(PlanningError):
     """Start and goal are both usable, but no chain of feasible edges joins them."""
 
 
+class DoubtfulRouteError(PlanningError):
+    """The cheapest route promises less than was asked: it would hardly be walked to its end."""
+
+
 class RenderingError(FgtutorError):
     """MuJoCo cannot draw on this machine: no graphics library works, or it gave up on the way."""
 

@@ -17,17 +17,18 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from fgtutor.directions import Headings
+from fgtutor.directions import HeadingCount, Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import (
     ConfigError,
+    DoubtfulRouteError,
     InfeasibleCellError,
     OffMapError,
     PlanningError,
@@ -66,6 +67,8 @@ __all__ = [
 
 Point = tuple[float, float]
 
+RAISE = 0.05
+"""By how much the least F of a step is raised to find a route that promises more."""
 SECONDS_PER_STEP = 1.9e-7
 """What a search takes, in one call that cannot show how far it is (measured, 4 policies)."""
 
@@ -96,7 +99,7 @@ class Plan:
         return self.answer.raise_for()
 
     def why_not(self, elevation: ElevationMap) -> list[str]:
-        """Say for each policy what it finds of the step on from the nearest place to the goal.
+        """Say for each policy what it finds of the step on from where the refusal says it fails.
 
         Empty where there is a route, or where the refusal is about the start or the goal itself.
         """
@@ -131,8 +134,10 @@ def plan_on_map(
 ) -> Plan:
     """Tensorize `elevation` for every policy of `zoo`, fuse, and plan from `start` to `goal`.
 
+    Where that finds no route it is done again along `finer_headings`, if those are more.
     `settings` are `PlanSettings()` unless given, `changes` change single ones of them by name.
-    `tensors` may hold F_i already computed, by name. `progress` shows a bar if it takes long.
+    `tensors` may hold F_i already computed, by name: then their headings are the only ones tried.
+    `progress` shows a bar if it takes long.
 
     Raises what `plan` and `assess_all` raise, at once where it can be known before the map is
     tensorized, and `ConfigError` for an empty zoo.
@@ -170,7 +175,13 @@ def plan_on_map(
         tensors=each,
         names=tuple(zoo),
     )
-    return Plan(tuple(zoo), each, weights, fused, policy_map, answer)
+    if answer or tensors or settings.finer_headings <= settings.headings:
+        return Plan(tuple(zoo), each, weights, fused, policy_map, answer)
+    if progress:
+        finer = f"trying {settings.finer_headings} headings"
+        print(f"no route along {settings.headings} headings: {finer}", file=sys.stderr)
+    settings = replace(settings, headings=settings.finer_headings)
+    return plan_on_map(elevation, zoo, start, goal, settings=settings, progress=progress)
 
 
 def plan(
@@ -188,8 +199,9 @@ def plan(
 ) -> Route | Refusal:
     """Return the cheapest route from `start` to `goal`, points (x, y) in metres, or a `Refusal`.
 
-    It is refused where start or goal was never observed or cannot be left or entered, or where no
-    chain of steps joins them; `.raise_for()` of the answer gives the route or raises the reason.
+    It is refused where start or goal was never observed or cannot be left or entered, where no
+    chain of steps joins them, or where none was found that promises `least_promise`;
+    `.raise_for()` of the answer gives the route or raises the reason.
 
     Args:
         fused: F_max [nx, ny, d], from `fusion.fuse`.
@@ -227,7 +239,7 @@ def plan(
     )
     try:
         return problem.cheapest(start, goal)
-    except (UnknownCellError, InfeasibleCellError, UnreachableError) as error:
+    except (UnknownCellError, InfeasibleCellError) as error:
         return Refusal(error)
 
 
@@ -312,12 +324,12 @@ class _Problem:
         if ends[0] == ends[1]:
             return self._route(np.array([[0, *ends[0]]]))
         self._check_open(start, goal)
-        networked = self.settings.backend == "networkx"
-        states = self.search.networkx(*ends) if networked else self.search.scipy(*ends)
+        states = self._searched(self.search, *ends)
         if states is None:
             nearest, heading = self._nearest(self.search.reached(ends[0]), ends[1])
-            few = self.headings.count < 32
-            more = "use headings=32, which see ways between these, " if few else ""
+            most = max(get_args(HeadingCount))
+            few = self.headings.count < most
+            more = f"use headings={most}, which see ways between these, " if few else ""
             error = UnreachableError(
                 f"start {self._text(start)} m, cell {ends[0]}, and goal {self._text(goal)} m, cell "
                 f"{ends[1]}, can both be used, but no chain of steps with F >= "
@@ -326,7 +338,38 @@ class _Problem:
                 "specialist (tensorization.why_blocked names what closes a cell)"
             )
             return Refusal(error, nearest, heading)
-        return self._route(states)
+        return self._surer(self._route(states), *ends)
+
+    def _searched(self, search: Search, start: Cell, goal: Cell) -> np.ndarray | None:
+        """Return the cheapest chain of states."""
+        networked = self.settings.backend == "networkx"
+        return search.networkx(start, goal) if networked else search.scipy(start, goal)
+
+    def _surer(self, cheapest: Route, start: Cell, goal: Cell) -> Route | Refusal:
+        """Return the route; if it promises too little, one without its worst steps, or a refusal.
+
+        The least F of a step is raised until the cheapest route promises enough or none is left.
+        """
+        route, floor = cheapest, self.settings.f_min
+        while route.promise < self.settings.least_promise:
+            floor += RAISE
+            surer = replace(self.search, layers=np.where(self.layers >= floor, self.layers, 0))
+            if (states := self._searched(surer, start, goal)) is None:
+                return self._doubt(cheapest)
+            route = self._route(states)
+        return route
+
+    def _doubt(self, route: Route) -> Refusal:
+        """Refuse a route that promises too little, and say which of its steps is the worst."""
+        worst = int(route.feasibility.argmin())
+        place, F = self.grid.centre_of(*route.cells[worst].tolist()), route.feasibility[worst]
+        error = DoubtfulRouteError(
+            f"the cheapest route, {route.length:.2f} m long, promises {route.promise:.2f}, less "
+            f"than least_promise = {self.settings.least_promise:g}, and no way round its worst "
+            f"steps was found: the worst, with F = {F:.2f}, begins at {self._text(place)} m; move "
+            "start or goal, add a specialist, or lower least_promise to walk it all the same"
+        )
+        return Refusal(error, place, int(route.headings[worst]))
 
     def _nearest(self, reached: np.ndarray, goal: Cell) -> tuple[Point, int]:
         """Return the reached cell nearest to the goal, m, and the heading on from it."""

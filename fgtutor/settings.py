@@ -16,6 +16,7 @@ Taus = Literal["paper", "calibrated"] | tuple[float, float]
 Unknown = Literal["block", "fill"]
 Backend = Literal["auto", "networkx", "scipy"]
 Cost = Literal["inverse", "length"]
+Promise = Annotated[float, Interval(ge=0, lt=1)]
 
 HEADINGS: HeadingCount = 8
 """The number of headings d unless another is asked for."""
@@ -29,6 +30,9 @@ class PlanSettings:
     """Thresholds of w_ood: "calibrated" (each specialist's own), "paper", or a pair for all."""
     headings: HeadingCount = HEADINGS
     """d, the number of headings: 8 (the paper's, to the neighbouring cells), 16 or 32."""
+    finer_headings: HeadingCount = 32
+    """Headings that `plan_on_map` tries where `headings` find no route: a bridge askew has none
+    along the eight. Not more than `headings`: no others are tried."""
     cost: Cost = "length"
     """Cost of a step: "inverse" is 1 / F (the paper, by which a diagonal step costs no more than a
     straight one and routes zigzag), "length" is that times the step's metres."""
@@ -40,6 +44,10 @@ class PlanSettings:
     hold_steps: Count = 3
     """Hysteresis on the drive: a policy takes over once it has been wanted for this many control
     steps; 1 is none."""
+    least_promise: Promise = 0.5
+    """What a route has to promise (`Route.promise`); 0: any will do. A way round the worst steps of
+    a route that promises less is looked for, else it is refused. Below the default it fails more
+    often than it arrives."""
     unknown: Unknown = "block"
     """What to do with unknown cells: "block" closes them, "fill" trusts the filled heights."""
     backend: Backend = "auto"
@@ -51,14 +59,26 @@ class PlanSettings:
 
     def __str__(self) -> str:
         taus = self.taus if isinstance(self.taus, str) else "{:g} to {:g}".format(*self.taus)
+        more = self.finer_headings > self.headings
+        finer = f" ({self.finer_headings} where they find no route)" if more else ""
+        promise = f", least promise {self.least_promise:g}" if self.least_promise else ""
         return (
-            f"tau {taus}, {self.headings} headings, f_min {self.f_min:g}, cost {self.cost}, "
-            f"switch cost {self.switch_cost:g}, hysteresis of {self.hold_steps} steps"
+            f"tau {taus}, {self.headings} headings{finer}, f_min {self.f_min:g}, cost {self.cost}, "
+            f"switch cost {self.switch_cost:g}, hysteresis of {self.hold_steps} steps{promise}"
         )
 
 
-PAPER = PlanSettings(taus="paper", headings=8, cost="inverse", switch_cost=0.0, hold_steps=1)
-"""The paper's own: tau 0.1 and 2.0, 8 headings, cost 1 / F, free switching, no hysteresis."""
+PAPER = PlanSettings(
+    taus="paper",
+    headings=8,
+    finer_headings=8,
+    cost="inverse",
+    switch_cost=0.0,
+    hold_steps=1,
+    least_promise=0.0,
+)
+"""The paper's own: tau 0.1 and 2.0, 8 headings, cost 1 / F, free switching, no hysteresis; any
+route will do."""
 SETTINGS = {"ours": PlanSettings(), "paper": PAPER}
 """The two settings that have a name."""
 
@@ -73,10 +93,14 @@ class PlanOptions:
     """Thresholds of w_ood: the paper's 0.1 and 2.0, or each specialist's own."""
     headings: HeadingCount | None = None
     """Headings that a cell can be left along (the paper's 8): more see ways off the axes."""
+    finer_headings: HeadingCount | None = None
+    """Headings that are tried where those find no route (ours 32, the paper's 8: no others)."""
     cost: Cost | None = None
     """Cost of a step: 1 / F (inverse, the paper's), or that times the step's metres."""
     f_min: Annotated[float, Interval(gt=0, le=1)] | None = None
     """Steps less feasible than this do not exist (0.1 in both)."""
+    least_promise: Promise | None = None
+    """How likely a route has to be walked to its end (ours 0.5, the paper's 0: any will do)."""
     switch_cost: NonNegative | None = None
     """Cost of changing the policy (ours 1, the paper's 0)."""
     hold_steps: Count | None = None

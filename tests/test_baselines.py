@@ -7,10 +7,10 @@ import torch
 
 from fgtutor.baselines import (
     AssessedMap,
+    Classical,
     OccupancyConfig,
     Switched,
     TraversabilityConfig,
-    classical,
     find_route,
     occupancy,
     ours,
@@ -200,7 +200,7 @@ def test_each_planner_drives_with_its_policies(known):
     assert drivers(without_fusion) == (["steps"] * 7, pytest.approx(7 / 0.8))
     # Back along -x: gaps at 0.45 beats 0.4; without fusion it is one policy, the cheaper one.
     assert drivers(ours, (0.85, 0.45), (0.15, 0.45)) == (["gaps"] * 7, pytest.approx(7 / 0.45))
-    flat = partial(classical, traversability)
+    flat = Classical(traversability)
     assert drivers(flat) == (["general"] * 7, pytest.approx(7.0))
     # On a flat classical map a diagonal step costs as much as a straight one: any way will do, and
     # P says who drives it.
@@ -222,7 +222,7 @@ def test_a_classical_map_refuses_what_a_specialist_crosses(known):
     steps = partial(single, "steps")
     assert find_route(steps, high, (0.15, 0.5), (0.95, 0.5)).names == ("steps",)
     for cells in (traversability, occupancy):
-        answer = find_route(partial(classical, cells), high, (0.15, 0.5), (0.95, 0.5))
+        answer = find_route(Classical(cells), high, (0.15, 0.5), (0.95, 0.5))
         assert isinstance(answer, Refusal) and "no policy can" in answer.reason
 
 

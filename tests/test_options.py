@@ -39,8 +39,8 @@ SENSE = {
     "clearance": (*HUGE, math.inf),
     **dict.fromkeys(("critic_warmup", "difficulty"), ZERO),
     **dict.fromkeys(("easiest", "easiest_at_last", "entropy", "f_min", "gamma", "heights"), ZERO),
-    **dict.fromkeys(("fusing_seconds", "label_seconds", "levels", "neighbours", "seed"), ZERO),
-    **dict.fromkeys(("seeds", "workers", "turned", "updates"), ZERO),
+    **dict.fromkeys(("fusing_seconds", "label_seconds", "least_promise", "levels"), ZERO),
+    **dict.fromkeys(("neighbours", "seed", "seeds", "workers", "turned", "updates"), ZERO),
     "angles": ZERO + BELOW,
 }
 """Which unusual values make sense, by the field's name; all others are refused."""

@@ -104,7 +104,8 @@ def planned(
     stages: Plan | None = None
     while len(answers) < 8 or stages is None:
         start, goal = rng.uniform((x0, y0), (x1, y1), (2, 2)).tolist()
-        one = plan_on_map(elevation, zoo, start, goal, settings=settings)
+        # The page knows the eight headings only.
+        one = plan_on_map(elevation, zoo, start, goal, settings=settings, finer_headings=8)
         stages = one if one.tensors else stages
         answer: dict[str, Any] = {"start": start, "goal": goal}
         if isinstance(one.answer, Route):

@@ -21,16 +21,16 @@ from annotated_types import Interval, MinLen
 from fgtutor.baselines import (
     OURS,
     AssessedMap,
+    Classical,
     OccupancyConfig,
     Planner,
     TraversabilityConfig,
-    classical,
     occupancy,
     ours,
     planners,
     traversability,
 )
-from fgtutor.directions import Headings
+from fgtutor.directions import HeadingCount, Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.evaluation.cost import Cost, estimate
@@ -82,6 +82,8 @@ STEPS = {"traversability": TraversabilityConfig.step, "occupancy": OccupancyConf
 class OpenGroundConfig(PlannedConfig):
     """Plan and drive over open ground, where tasks have several ways or none."""
 
+    finer_headings: HeadingCount | None = None
+    """Headings that are tried where the others find no route (ours 32, the paper's 8: none)."""
     robot: str = "a1"
     """Which robot."""
     maps: Annotated[int, Interval(ge=1, le=10_000)] = 100
@@ -132,7 +134,7 @@ def ways(
             except ValueError:
                 raise ConfigError(f"{name!r}: a critical step in metres goes after @") from None
             cells = _traversability if base == "traversability" else _occupancy
-            found[name] = partial(classical, partial(cells, step)), settings
+            found[name] = Classical(partial(cells, step)), settings
         else:
             choose("planner", [name], known)
             found[name] = known[name], PAPER if name == PAPERS else settings

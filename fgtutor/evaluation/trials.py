@@ -14,6 +14,7 @@ from time import process_time
 from typing import Any, TypedDict, TypeVar
 
 from fgtutor.baselines import AssessedMap, Planner, find_route
+from fgtutor.directions import HeadingCount
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.evaluation.shards import RunConfig, digest, settings_of
@@ -76,6 +77,10 @@ class ZooConfig(RunConfig):
 @dataclass(frozen=True, kw_only=True)
 class PlannedConfig(PlanOptions, ZooConfig):
     """Which specialists plan, and by what settings."""
+
+    finer_headings: HeadingCount | None = 8
+    """Headings that are tried where the others find no route; 8: none are. Obstacles of the
+    standard terrains lie along the axes."""
 
     def run_settings(
         self, command: str, *, without: Collection[str] = (), **more: Any

@@ -19,6 +19,7 @@ import numpy as np
 from annotated_types import Len
 
 from fgtutor.baselines import OURS, ours
+from fgtutor.directions import HeadingCount
 from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.report import (
     Findings,
@@ -54,6 +55,8 @@ COMMAND = "evaluate turned"
 class TurnedConfig(DisturbedConfig):
     """Cross one obstacle, turned by some angles."""
 
+    finer_headings: HeadingCount | None = None
+    """Headings that are tried where the others find no route (ours 32, the paper's 8: none)."""
     robot: str = "a1"
     """Which robot."""
     terrains: Annotated[tuple[str, ...], Unique] = ()

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError
+from fgtutor.errors import ConfigError, DoubtfulRouteError
 from fgtutor.figures.panels import (
     BLOCKED,
     hatch_unknown,
@@ -219,7 +219,10 @@ def plan_figure(elevation: ElevationMap, plan: Plan, *, f_min: float = 0.1) -> P
         draw_route(plan.answer, elevation, axes=first)
     elif plan.answer.nearest:
         first.plot(*plan.answer.nearest, "X", color=BLOCKED, markersize=11)
-        first.set_title("No route leads nearer to the goal than X", **TITLE, loc="left")
+        doubtful = isinstance(plan.answer.error, DoubtfulRouteError)
+        words = "X: the worst step of a route that promises too little"
+        words = words if doubtful else "No route leads nearer to the goal than X"
+        first.set_title(words, **TITLE, loc="left")
     columns = int(np.ceil(np.sqrt(len(plan.names))))
     rows = -(-len(plan.names) // columns)
     panels[0, 1].suptitle("2  Have I seen this before? w_ood of each policy", **TITLE, x=0.02)

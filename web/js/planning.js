@@ -7,15 +7,35 @@
  * another policy costs `switchCost` more, and exists only where both policies are feasible.
  */
 
-/** @typedef {{cost: "length" | "inverse", fMin: number, switchCost: number}} PlanSettings */
+/**
+ * @typedef {object} PlanSettings
+ * @property {"length" | "inverse"} cost
+ * @property {number} fMin
+ * @property {number} switchCost
+ * @property {number} leastPromise - What a route has to promise; 0: any will do.
+ */
 
 /** Our settings: what every table uses. */
-export const OURS = { taus: "calibrated", cost: "length", fMin: 0.1, switchCost: 1 };
-/** The paper's: its thresholds on L_recon, cost 1 / F, free switching. */
-export const PAPER = { taus: [0.1, 2.0], cost: "inverse", fMin: 0.1, switchCost: 0 };
+export const OURS = {
+  taus: "calibrated",
+  cost: "length",
+  fMin: 0.1,
+  switchCost: 1,
+  leastPromise: 0.5,
+};
+/** The paper's: its thresholds on L_recon, cost 1 / F, free switching; any route will do. */
+export const PAPER = {
+  taus: [0.1, 2.0],
+  cost: "inverse",
+  fMin: 0.1,
+  switchCost: 0,
+  leastPromise: 0,
+};
 
 /** Walks that end per metre are exp(HAZARD - RELIEF F); fitted to drives of the A1. */
-const [HAZARD, RELIEF] = [1, 12];
+const [HAZARD, RELIEF] = [4, 20];
+/** By how much the least F of a step is raised to find a route that promises more. */
+const RAISE = 0.05;
 
 /**
  * @typedef {object} Route
@@ -32,7 +52,8 @@ const [HAZARD, RELIEF] = [1, 12];
  *
  * @typedef {object} Refusal
  * @property {string} reason
- * @property {[number, number]} [nearest] - The reached cell nearest to the goal.
+ * @property {[number, number]} [nearest] - The reached cell nearest to the goal, or where the worst
+ *   step of a route begins that promises too little.
  * @property {number} [heading] - The heading on from there.
  */
 
@@ -80,7 +101,18 @@ export function plan({ tensors, fused, policyMap, map, known, steps, headings, .
     );
   }
   const states = search.run(first, last);
-  if (states) return { route: search.route(states, policyMap) };
+  if (states) {
+    const cheapest = search.route(states, policyMap);
+    let route = cheapest;
+    for (let { fMin } = settings; route.promise < settings.leastPromise; ) {
+      fMin += RAISE;
+      const surer = new Search(layers, map, steps, headings, { ...settings, fMin });
+      const found = surer.run(first, last);
+      if (!found) return doubt(cheapest, settings);
+      route = surer.route(found, policyMap);
+    }
+    return { route };
+  }
   const [cell, heading] = search.nearest(ends[1]);
   const [x, y] = centreOf(map, cell);
   return refuse(
@@ -89,6 +121,21 @@ export function plan({ tensors, fused, policyMap, map, known, steps, headings, .
       `${y.toFixed(2)}) m; lower f_min, move one of them or add a specialist`,
     cell,
     heading,
+  );
+}
+
+/** Refuse a route that promises too little, and say which of its steps is the worst. */
+function doubt(route, { leastPromise }) {
+  const F = Math.min(...route.feasibility);
+  const worst = route.feasibility.indexOf(F);
+  const place = route.xy[worst].map((value) => value.toFixed(2)).join(", ");
+  return refuse(
+    `the cheapest route, ${route.length.toFixed(2)} m long, promises ${route.promise.toFixed(2)}, ` +
+      `less than ${leastPromise}, and no way round its worst steps was found: the worst, with F = ` +
+      `${F.toFixed(2)}, begins at (${place}) m; move start or goal, add a specialist, or lower ` +
+      "the least promise to walk it all the same",
+    route.cells[worst],
+    route.headings[worst],
   );
 }
 

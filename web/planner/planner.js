@@ -46,18 +46,20 @@ function settings() {
     alpha: number("alpha"),
     fMin: number("fmin"),
     switchCost: number("switch"),
+    leastPromise: number("promise"),
     cost: $("cost").value,
   };
 }
 
 /** Set the controls to our settings or the paper's. */
-function begin({ taus, cost, fMin, switchCost }) {
+function begin({ taus, cost, fMin, switchCost, leastPromise }) {
   $("ood").value = taus === "calibrated" ? "calibrated" : "taus";
   if (taus !== "calibrated") [$("low").value, $("high").value] = taus;
   $("alpha").value = 0.03;
   $("cost").value = cost;
   $("fmin").value = fMin;
   $("switch").value = switchCost;
+  $("promise").value = leastPromise;
 }
 
 /** Return the indices of the policies in the team. */
@@ -75,6 +77,7 @@ function label() {
     high: number("high").toFixed(2),
     fmin: number("fmin").toFixed(2),
     switch: number("switch").toFixed(1),
+    promise: number("promise").toFixed(2),
   };
   for (const [id, text] of Object.entries(words)) $(`${id}-words`).textContent = text;
   for (const one of document.querySelectorAll("[data-for]")) {
@@ -393,7 +396,7 @@ function listen() {
     label();
     ask();
   });
-  for (const id of ["ood", "alpha", "low", "high", "fmin", "switch", "cost"]) {
+  for (const id of ["ood", "alpha", "low", "high", "fmin", "switch", "promise", "cost"]) {
     $(id).addEventListener("input", () => {
       label();
       ask();
