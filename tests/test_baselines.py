@@ -21,8 +21,9 @@ from fgtutor.baselines import (
     without_heading,
     without_ood,
 )
+from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError
+from fgtutor.errors import ConfigError, DoubtfulRouteError
 from fgtutor.feasibility import OodScore
 from fgtutor.planning import PAPER, Refusal
 from fgtutor.tensorization import Assessment, assess_all, tensorize
@@ -224,6 +225,39 @@ def test_a_classical_map_refuses_what_a_specialist_crosses(known):
     for cells in (traversability, occupancy):
         answer = find_route(Classical(cells), high, (0.15, 0.5), (0.95, 0.5))
         assert isinstance(answer, Refusal) and "no policy can" in answer.reason
+
+
+def test_routes_of_a_classical_map_need_promise_nothing(known):
+    """Its F is a cost in disguise: near a wall it is low, and the robot is none the worse."""
+
+    def near_walls(elevation, radius):
+        return np.full(elevation.shape, 0.12)
+
+    ends = (0.15, 0.45), (0.85, 0.45)
+    route = find_route(Classical(near_walls), known, *ends)
+    assert route.promise < 0.1 and route.length == pytest.approx(0.7)
+    low = [{"steps": torch.full((*known.elevation.shape, 8), 0.12)}]
+    answer = find_route(lambda ground: low, known, *ends, finer_headings=8)
+    assert isinstance(answer.error, DoubtfulRouteError)
+
+
+def test_finer_headings_are_tried_where_the_others_find_no_route(known):
+    """A ground that is feasible along +2x+y and back only."""
+
+    def askew(ground):
+        headings = Headings(ground.headings)
+        tensor = torch.zeros(*ground.elevation.shape, headings.count)
+        for step in ((2, 1), (-2, -1)):
+            tensor[..., (headings.steps == step).all(axis=-1)] = 0.9
+        return [{"steps": torch.from_numpy(headings.least(tensor.numpy()))}]
+
+    ends = (0.15, 0.25), (0.75, 0.55)
+    route = find_route(askew, known, *ends)
+    assert route.num_headings == 32 and route.length == pytest.approx(0.3 * math.sqrt(5))
+    assert find_route(askew, known, *ends, finer_headings=16).num_headings == 16
+    assert not find_route(askew, known, *ends, finer_headings=8)
+    assert not find_route(askew, known.along(16), (0.15, 0.25), (0.15, 0.75))
+    assert known.along(32) is known.along(32)
 
 
 def test_planners_are_those_that_the_zoo_allows(assessed):

@@ -7,11 +7,13 @@ import pytest
 from scipy import ndimage
 
 from fgtutor.__main__ import main
-from fgtutor.errors import ConfigError, TerrainError
+from fgtutor.errors import ConfigError, DoubtfulRouteError, TerrainError, UnreachableError
 from fgtutor.evaluation import trials, turned
 from fgtutor.evaluation.turned import TurnedConfig, run, shortest, table
+from fgtutor.planning import plan_on_map
 from fgtutor.robots.a1.env import DROP, RIM
 from fgtutor.robots.a1.ground import rims
+from fgtutor.specialist import load_zoo
 from fgtutor.world.boxes import Box, rasterise
 from fgtutor.world.obstacles import Course, TerrainScale
 from fgtutor.world.terrain import make_terrain
@@ -119,6 +121,21 @@ def test_the_shortest_way_by_hand():
     legs = (np.linalg.norm(begin - start), 3.0, np.linalg.norm(goal - end))
     assert shortest(beam) == pytest.approx(sum(legs) - 0.35)
     assert shortest(beam) > 6.5 - 0.35
+
+
+@pytest.mark.slow
+def test_a_bridge_askew_is_planned_over_without_asking_for_more_headings(capsys):
+    terrain, zoo = make_turned("bridge", angle=22, seed=1), load_zoo("a1")
+    given = terrain.elevation, {"bridge": zoo["bridge"]}, terrain.start, terrain.goal
+    refused = plan_on_map(*given, finer_headings=8)
+    assert refused.fused.shape[-1] == 8
+    assert isinstance(refused.answer.error, UnreachableError | DoubtfulRouteError)
+    planned = plan_on_map(*given, progress=True)
+    assert planned.fused.shape[-1] == planned.route.num_headings == 32
+    assert "no route along 8 headings: trying 32" in capsys.readouterr().err
+    # Tensors that were given have the headings that they have.
+    tensors = {"bridge": refused.tensors[0]}
+    assert not plan_on_map(*given, tensors=tensors).answer
 
 
 @pytest.mark.parametrize(
