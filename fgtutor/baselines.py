@@ -22,10 +22,10 @@ from torch import Tensor
 
 from fgtutor.directions import HeadingCount, Headings
 from fgtutor.elevation import ElevationMap
-from fgtutor.errors import ConfigError, UnknownCellError
+from fgtutor.errors import ConfigError
 from fgtutor.fusion import fuse
 from fgtutor.io.validation import Count, Positive, check_fields
-from fgtutor.planning import Point, plan_on_map
+from fgtutor.planning import Point, finer, plan_on_map
 from fgtutor.routes import Refusal, Route
 from fgtutor.settings import HEADINGS, PlanSettings, Taus
 from fgtutor.specialist import GENERAL, Specialist
@@ -334,9 +334,8 @@ def find_route(
     if not answers:
         raise ConfigError("this planner has no policy to plan for: the zoo is empty")
     routes = [answer for answer in answers if isinstance(answer, Route)]
-    refusal = answers[-1]
-    if routes or isinstance(refusal.error, UnknownCellError):
-        return min(routes, key=lambda route: route.cost, default=refusal)
-    if settings.finer_headings <= ground.headings:
-        return refusal
-    return find_route(planner, ground.along(settings.finer_headings), start, goal, settings)
+    best = min(routes, key=lambda route: route.cost, default=answers[-1])
+    more = finer(settings, best)
+    if more is None:
+        return best
+    return find_route(planner, ground.along(more.headings), start, goal, more)

@@ -32,6 +32,7 @@ from fgtutor.errors import (
     InfeasibleCellError,
     OffMapError,
     PlanningError,
+    TooLargeError,
     UnknownCellError,
     UnreachableError,
 )
@@ -134,7 +135,8 @@ def plan_on_map(
 ) -> Plan:
     """Tensorize `elevation` for every policy of `zoo`, fuse, and plan from `start` to `goal`.
 
-    Where that finds no route it is done again along `finer_headings`, if those are more.
+    Where that finds no route it is done again along `finer_headings`, if those are more and fit
+    into memory.
     `settings` are `PlanSettings()` unless given, `changes` change single ones of them by name.
     `tensors` may hold F_i already computed, by name: then their headings are the only ones tried.
     `progress` shows a bar if it takes long.
@@ -175,13 +177,26 @@ def plan_on_map(
         tensors=each,
         names=tuple(zoo),
     )
-    if answer or tensors or settings.finer_headings <= settings.headings:
-        return Plan(tuple(zoo), each, weights, fused, policy_map, answer)
+    planned = Plan(tuple(zoo), each, weights, fused, policy_map, answer)
+    more = finer(settings, answer)
+    if more is None or tensors:
+        return planned
     if progress:
-        finer = f"trying {settings.finer_headings} headings"
-        print(f"no route along {settings.headings} headings: {finer}", file=sys.stderr)
-    settings = replace(settings, headings=settings.finer_headings)
-    return plan_on_map(elevation, zoo, start, goal, settings=settings, progress=progress)
+        trying = f"trying {more.headings} headings"
+        print(f"no route along {settings.headings} headings: {trying}", file=sys.stderr)
+    try:
+        return plan_on_map(elevation, zoo, start, goal, settings=more, progress=progress)
+    except TooLargeError:  # then the refusal stands
+        return planned
+
+
+def finer(settings: PlanSettings, answer: Route | Refusal) -> PlanSettings | None:
+    """Return the settings to try after `answer`: with `finer_headings`, if it is a refusal and
+    those are more; None if there are none."""
+    if isinstance(answer, Route) or isinstance(answer.error, UnknownCellError):
+        return None
+    more = settings.finer_headings > settings.headings
+    return replace(settings, headings=settings.finer_headings) if more else None
 
 
 def plan(

@@ -7,7 +7,13 @@ import pytest
 from scipy import ndimage
 
 from fgtutor.__main__ import main
-from fgtutor.errors import ConfigError, DoubtfulRouteError, TerrainError, UnreachableError
+from fgtutor.errors import (
+    ConfigError,
+    DoubtfulRouteError,
+    TerrainError,
+    TooLargeError,
+    UnreachableError,
+)
 from fgtutor.evaluation import trials, turned
 from fgtutor.evaluation.turned import TurnedConfig, run, shortest, table
 from fgtutor.planning import plan_on_map
@@ -124,7 +130,11 @@ def test_the_shortest_way_by_hand():
 
 
 @pytest.mark.slow
-def test_a_bridge_askew_is_planned_over_without_asking_for_more_headings(capsys):
+def test_a_bridge_askew_is_planned_over_without_asking_for_more_headings(monkeypatch, capsys):
+    def little_memory(shape, policies, switch_cost, headings):
+        if headings.count > 8:
+            raise TooLargeError("no room")
+
     terrain, zoo = make_turned("bridge", angle=22, seed=1), load_zoo("a1")
     given = terrain.elevation, {"bridge": zoo["bridge"]}, terrain.start, terrain.goal
     refused = plan_on_map(*given, finer_headings=8)
@@ -133,6 +143,9 @@ def test_a_bridge_askew_is_planned_over_without_asking_for_more_headings(capsys)
     planned = plan_on_map(*given, progress=True)
     assert planned.fused.shape[-1] == planned.route.num_headings == 32
     assert "no route along 8 headings: trying 32" in capsys.readouterr().err
+    # Where that many do not fit into memory, the refusal stands.
+    monkeypatch.setattr("fgtutor.planning.check_memory", little_memory)
+    assert plan_on_map(*given).fused.shape[-1] == 8
     # Tensors that were given have the headings that they have.
     tensors = {"bridge": refused.tensors[0]}
     assert not plan_on_map(*given, tensors=tensors).answer
