@@ -239,7 +239,10 @@ def without_ood(ground: AssessedMap) -> Sequence[Layers]:
 
 
 def without_heading(ground: AssessedMap) -> Sequence[Layers]:
-    """Ours with one number per cell, the mean of F_i over the headings."""
+    """Ours with one number per cell, the mean of F_i over the headings.
+
+    That is no step's F, so its routes promise nothing (see `find_route`).
+    """
     tensors = ground.tensors()
     return [{name: _all_headings(tensor.mean(dim=-1), ground) for name, tensor in tensors.items()}]
 
@@ -318,11 +321,12 @@ def find_route(
 
     `settings` and `changes` are those of `planning.plan`, but for the thresholds and headings,
     which are the map's; `finer_headings` are tried where those find no route, if they are more.
-    On classical maps every route will do, and where P names the drivers (`Switched`), changes of
-    policy are free. Raises `ConfigError` if the planner offers no layers.
+    Where F is not what a policy says of a step (classical maps, no heading) every route will do, and
+    where P names the drivers (`Switched`) changes of policy are free. Raises `ConfigError` if the
+    planner offers no layers.
     """
     settings = replace(settings or PlanSettings(), **changes | {"headings": ground.headings})
-    if isinstance(planner, Classical):
+    if isinstance(planner, Classical) or planner is without_heading:
         settings = replace(settings, least_promise=0.0)
     if isinstance(planner, Switched):
         settings = replace(settings, switch_cost=0.0)

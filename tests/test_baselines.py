@@ -228,7 +228,8 @@ def test_a_classical_map_refuses_what_a_specialist_crosses(known):
 
 
 def test_routes_of_a_classical_map_need_promise_nothing(known):
-    """Its F is a cost in disguise: near a wall it is low, and the robot is none the worse."""
+    """Its F is a cost in disguise: near a wall it is low, and the robot is none the worse. A mean
+    over the headings is no step's F either."""
 
     def near_walls(elevation, radius):
         return np.full(elevation.shape, 0.12)
@@ -236,6 +237,9 @@ def test_routes_of_a_classical_map_need_promise_nothing(known):
     ends = (0.15, 0.45), (0.85, 0.45)
     route = find_route(Classical(near_walls), known, *ends)
     assert route.promise < 0.1 and route.length == pytest.approx(0.7)
+    known._known["steps"] = by_hand(known.elevation, torch.tensor(0.12), torch.tensor(0.0))
+    known._known["gaps"] = by_hand(known.elevation, torch.tensor(0.12), torch.tensor(0.0))
+    assert find_route(without_heading, known, *ends).promise < 0.1
     low = [{"steps": torch.full((*known.elevation.shape, 8), 0.12)}]
     answer = find_route(lambda ground: low, known, *ends, finer_headings=8)
     assert isinstance(answer.error, DoubtfulRouteError)
