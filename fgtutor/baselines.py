@@ -321,7 +321,7 @@ def find_route(
 
     `settings` and `changes` are those of `planning.plan`, but for the thresholds and headings,
     which are the map's; `finer_headings` are tried where those find no route, if they are more.
-    Where F is not what a policy says of a step (classical maps, no heading) every route will do, and
+    Where F is not what a policy says of a step (classical maps, no heading) every route will do;
     where P names the drivers (`Switched`) changes of policy are free. Raises `ConfigError` if the
     planner offers no layers.
     """
