@@ -76,6 +76,8 @@ def test_without_w_ood_a_route_goes_where_ours_refuses(make_rolling):
     shy = make_rolling(f=0.02, quantiles={"0.5": 1e-9, "0.9": 2e-9, "0.95": 3e-9, "0.99": 4e-9})
     ground, ends = AssessedMap(wall, {"steps": shy}), ((0.55, 0.55), (2.45, 0.55))
     assert not find_route(ours, ground, *ends)
-    route = find_route(without_ood, ground, *ends, f_min=1e-9).raise_for()
+    brave = {"f_min": 1e-9, "least_promise": 0.0}
+    route = find_route(without_ood, ground, *ends, **brave).raise_for()
+    assert not find_route(ours, ground, *ends, least_promise=0.0)
     assert len(route.headings) == 19 and route.names == ("steps",)
     assert route.feasibility == pytest.approx(0.02, abs=1e-6)

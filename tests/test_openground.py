@@ -2,7 +2,6 @@
 
 import json
 import math
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 from scipy import ndimage
 
 from fgtutor.__main__ import main
+from fgtutor.baselines import Classical
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, TerrainError
 from fgtutor.evaluation.openground import OpenGroundConfig, shortest_ways, ways
@@ -166,8 +166,8 @@ def test_planners_have_names_and_steps():
     step = ElevationMap(np.repeat([[0.0], [0.15]], 20, axis=0) * np.ones((40, 40)))
     for name, open_ in (("occupancy@0.2", True), ("occupancy@0.1", False)):
         planner, _ = ways(OpenGroundConfig(robot="toy", planners=(name,)), zoo)[name]
-        assert isinstance(planner, partial)
-        cells = planner.args[0](step, 0.1)
+        assert isinstance(planner, Classical)
+        cells = planner.cells(step, 0.1)
         assert (cells > 0).all() == open_
     for name in ("occupancy@high", "nonsense", "ours@0.2"):
         with pytest.raises(ConfigError):
