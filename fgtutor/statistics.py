@@ -10,7 +10,6 @@ from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import binomtest, rankdata
 
 from fgtutor.errors import ConfigError
 
@@ -23,6 +22,8 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """
     if not 0 <= successes <= trials or trials == 0:
         raise ConfigError(f"need 0 <= successes <= trials, trials > 0; got {successes} of {trials}")
+    from scipy.stats import binomtest  # takes a second to load, and workers ask for no interval
+
     low, high = binomtest(successes, trials).proportion_ci(method="wilson")
     return float(low), float(high)
 
@@ -100,6 +101,8 @@ def auroc(
     Equal scores count one half: 0.5 is what chance gives. None where nothing failed, or all did.
     """
     outcomes = np.asarray(outcomes, dtype=bool)
+    from scipy.stats import rankdata  # as above
+
     won, lost = int(outcomes.sum()), int((~outcomes).sum())
     if not won or not lost:
         return None

@@ -26,7 +26,6 @@ import numpy as np
 from fgtutor.evaluation.cost import Cost
 from fgtutor.evaluation.shards import Run, RunConfig, collect, finished
 from fgtutor.evaluation.tasks import Task
-from fgtutor.figures.charts import draw_reliability, draw_shares
 from fgtutor.io.machine import usable_cores
 from fgtutor.io.storage import atomic_write, locked_folder, make_folder, write_json
 from fgtutor.statistics import Share
@@ -39,7 +38,13 @@ Draw = Callable[[Path], object]
 
 def shares_chart(groups: Mapping[str, Mapping[str, Share]], title: str) -> Draw:
     """Return what draws shares within groups, when and if the report is written."""
-    return lambda path: draw_shares(groups, title=title).savefig(path)
+
+    def draw(path: Path) -> None:
+        from fgtutor.figures.charts import draw_shares  # matplotlib: no worker needs it
+
+        draw_shares(groups, title=title).savefig(path)
+
+    return draw
 
 
 def reliability_chart(trials: Sequence[Mapping[str, Any]]) -> dict[str, Draw]:
@@ -53,7 +58,13 @@ def reliability_chart(trials: Sequence[Mapping[str, Any]]) -> dict[str, Draw]:
         return {}
     promised = np.array([row["promise"] for row in driven])
     arrived = np.array([row["outcome"] == "reached" for row in driven])
-    return {"reliability.svg": lambda path: draw_reliability(promised, arrived).savefig(path)}
+
+    def draw(path: Path) -> None:
+        from fgtutor.figures.charts import draw_reliability
+
+        draw_reliability(promised, arrived).savefig(path)
+
+    return {"reliability.svg": draw}
 
 
 def markdown(columns: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
