@@ -79,7 +79,7 @@ def test_a_way_round_what_promises_too_little_is_found(backend):
 def test_without_a_way_round_it_is_refused_and_the_worst_step_is_named():
     refusal = across_a_strip(False)
     assert isinstance(refusal.error, DoubtfulRouteError)
-    for words in ("1.75 m long, promises 0.23, less than least_promise = 0.5", "with F = 0.12"):
+    for words in ("1.75 m long, promises 0.23, less than least_promise = 0.25", "with F = 0.12"):
         assert words in refusal.reason
     strip = ElevationMap(np.zeros((40, 41)), resolution=0.05).cell_of(*refusal.nearest)
     assert 17 <= strip[0] < 23 and Headings(8).steps[refusal.heading][0] == 1

@@ -21,7 +21,7 @@ export const OURS = {
   cost: "length",
   fMin: 0.1,
   switchCost: 1,
-  leastPromise: 0.5,
+  leastPromise: 0.25,
 };
 /** The paper's: its thresholds on L_recon, cost 1 / F, free switching; any route will do. */
 export const PAPER = {
