@@ -25,7 +25,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.fusion import fuse
 from fgtutor.io.validation import Count, Positive, check_fields
-from fgtutor.planning import Point, finer, plan_on_map
+from fgtutor.planning import Point, finer, plan_on_map, stands
 from fgtutor.routes import Refusal, Route
 from fgtutor.settings import HEADINGS, PlanSettings, Taus
 from fgtutor.specialist import GENERAL, Specialist
@@ -320,7 +320,7 @@ def find_route(
     """Return the planner's cheapest route, whose `names` are the policies that may drive it.
 
     `settings` and `changes` are those of `planning.plan`, but for the thresholds and headings,
-    which are the map's; `finer_headings` are tried where those find no route, if they are more.
+    which are the map's; `finer_headings` are tried after those as by `plan_on_map`.
     Where F is not what a policy says of a step (classical maps, no heading) every route will do;
     where P names the drivers (`Switched`) changes of policy are free. Raises `ConfigError` if the
     planner offers no layers.
@@ -342,4 +342,5 @@ def find_route(
     more = finer(settings, best)
     if more is None:
         return best
-    return find_route(planner, ground.along(more.headings), start, goal, more)
+    other = find_route(planner, ground.along(more.headings), start, goal, more)
+    return best if stands(best, other) else other

@@ -68,6 +68,8 @@ __all__ = [
 
 Point = tuple[float, float]
 
+SURE = 0.5
+"""A route that promises less fails more often than it arrives: `finer_headings` are tried too."""
 RAISE = 0.05
 """By how much the least F of a step is raised to find a route that promises more."""
 SECONDS_PER_STEP = 1.9e-7
@@ -135,8 +137,8 @@ def plan_on_map(
 ) -> Plan:
     """Tensorize `elevation` for every policy of `zoo`, fuse, and plan from `start` to `goal`.
 
-    Where that finds no route it is done again along `finer_headings`, if those are more and fit
-    into memory.
+    Where that finds no route, or one that promises less than `SURE`, it is done again along
+    `finer_headings`, if those are more and fit into memory; the route that promises more is taken.
     `settings` are `PlanSettings()` unless given, `changes` change single ones of them by name.
     `tensors` may hold F_i already computed, by name: then their headings are the only ones tried.
     `progress` shows a bar if it takes long.
@@ -182,21 +184,36 @@ def plan_on_map(
     if more is None or tensors:
         return planned
     if progress:
+        found = "a doubtful route" if answer else "no route"
         trying = f"trying {more.headings} headings"
-        print(f"no route along {settings.headings} headings: {trying}", file=sys.stderr)
+        print(f"{found} along {settings.headings} headings: {trying}", file=sys.stderr)
     try:
-        return plan_on_map(elevation, zoo, start, goal, settings=more, progress=progress)
-    except TooLargeError:  # then the refusal stands
+        other = plan_on_map(elevation, zoo, start, goal, settings=more, progress=progress)
+    except TooLargeError:  # then the first answer stands
         return planned
+    return planned if stands(answer, other.answer) else other
 
 
 def finer(settings: PlanSettings, answer: Route | Refusal) -> PlanSettings | None:
-    """Return the settings to try after `answer`: with `finer_headings`, if it is a refusal and
-    those are more; None if there are none."""
-    if isinstance(answer, Route) or isinstance(answer.error, UnknownCellError):
+    """Return the settings to try after `answer`, those with `finer_headings` if they are more.
+
+    None after a route that promises `SURE` (any, where `least_promise` is 0), and where the start
+    or the goal was never observed.
+    """
+    if isinstance(answer, Route):
+        enough = answer.promise >= SURE or not settings.least_promise
+    else:
+        enough = isinstance(answer.error, UnknownCellError)
+    if enough or settings.finer_headings <= settings.headings:
         return None
-    more = settings.finer_headings > settings.headings
-    return replace(settings, headings=settings.finer_headings) if more else None
+    return replace(settings, headings=settings.finer_headings)
+
+
+def stands(answer: Route | Refusal, other: Route | Refusal) -> bool:
+    """Return whether an answer is no worse than what was tried after it."""
+    if isinstance(answer, Route) and isinstance(other, Route):
+        return answer.promise >= other.promise
+    return isinstance(answer, Route)
 
 
 def plan(

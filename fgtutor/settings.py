@@ -31,8 +31,8 @@ class PlanSettings:
     headings: HeadingCount = HEADINGS
     """d, the number of headings: 8 (the paper's, to the neighbouring cells), 16 or 32."""
     finer_headings: HeadingCount = 32
-    """Headings that `plan_on_map` tries where `headings` find no route: a bridge askew has none
-    along the eight. Not more than `headings`: no others are tried."""
+    """Headings that `plan_on_map` tries where `headings` find no route, or a doubtful one: a bridge
+    askew has none along the eight. Not more than `headings`: no others are tried."""
     cost: Cost = "length"
     """Cost of a step: "inverse" is 1 / F (the paper, by which a diagonal step costs no more than a
     straight one and routes zigzag), "length" is that times the step's metres."""
@@ -60,7 +60,7 @@ class PlanSettings:
     def __str__(self) -> str:
         taus = self.taus if isinstance(self.taus, str) else "{:g} to {:g}".format(*self.taus)
         more = self.finer_headings > self.headings
-        finer = f" ({self.finer_headings} where they find no route)" if more else ""
+        finer = f" ({self.finer_headings} where they find no sure route)" if more else ""
         promise = f", least promise {self.least_promise:g}" if self.least_promise else ""
         return (
             f"tau {taus}, {self.headings} headings{finer}, f_min {self.f_min:g}, cost {self.cost}, "
@@ -94,7 +94,7 @@ class PlanOptions:
     headings: HeadingCount | None = None
     """Headings that a cell can be left along (the paper's 8): more see ways off the axes."""
     finer_headings: HeadingCount | None = None
-    """Headings that are tried where those find no route (ours 32, the paper's 8: no others)."""
+    """Headings to try where those find no sure route (ours 32, the paper's 8: no others)."""
     cost: Cost | None = None
     """Cost of a step: 1 / F (inverse, the paper's), or that times the step's metres."""
     f_min: Annotated[float, Interval(gt=0, le=1)] | None = None

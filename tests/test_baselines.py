@@ -25,7 +25,8 @@ from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, DoubtfulRouteError
 from fgtutor.feasibility import OodScore
-from fgtutor.planning import PAPER, Refusal
+from fgtutor.planning import PAPER, SURE, Refusal
+from fgtutor.routes import HAZARD, RELIEF
 from fgtutor.tensorization import Assessment, assess_all, tensorize
 
 RADIUS = 0.1
@@ -261,6 +262,24 @@ def test_finer_headings_are_tried_where_the_others_find_no_route(known):
     assert find_route(askew, known, *ends, finer_headings=16).num_headings == 16
     assert not find_route(askew, known, *ends, finer_headings=8)
     assert not find_route(askew, known.along(16), (0.15, 0.25), (0.15, 0.75))
+
+    def doubtful(ground):
+        """The same, and a chance along the axes."""
+        tensor = askew(ground)[0]["steps"]
+        along = (Headings(ground.headings).steps == 0).any(axis=-1)
+        tensor[..., along] = 0.2
+        return [{"steps": tensor}]
+
+    # Along the eight a route promises 0.4; along the 32 nearly 1, and that one is taken.
+    coarse = find_route(doubtful, known, *ends, finer_headings=8)
+    assert coarse.promise == pytest.approx(math.exp(-0.9 * math.exp(HAZARD - RELIEF * 0.2)))
+    assert 0.25 < coarse.promise < SURE
+    assert find_route(doubtful, known, *ends).num_headings == 32
+    # Where none is surer, or any will do, the first one stands.
+    brave = {"least_promise": 0.0}
+    assert find_route(doubtful, known, *ends, **brave).num_headings == 8
+    straight_on = (0.15, 0.25), (0.85, 0.25)
+    assert find_route(doubtful, known, *straight_on).num_headings == 8
     assert known.along(32) is known.along(32)
 
 

@@ -79,8 +79,8 @@ class PlannedConfig(PlanOptions, ZooConfig):
     """Which specialists plan, and by what settings."""
 
     finer_headings: HeadingCount | None = 8
-    """Headings that are tried where the others find no route; 8: none are. Obstacles of the
-    standard terrains lie along the axes."""
+    """Headings to try where the others find no sure route; 8: none. Obstacles of the standard
+    terrains lie along the axes."""
 
     def run_settings(
         self, command: str, *, without: Collection[str] = (), **more: Any
