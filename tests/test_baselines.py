@@ -278,8 +278,12 @@ def test_finer_headings_are_tried_where_the_others_find_no_route(known):
     # Where none is surer, or any will do, the first one stands.
     brave = {"least_promise": 0.0}
     assert find_route(doubtful, known, *ends, **brave).num_headings == 8
-    straight_on = (0.15, 0.25), (0.85, 0.25)
-    assert find_route(doubtful, known, *straight_on).num_headings == 8
+
+    def level(ground):
+        return [{"steps": torch.full((*ground.elevation.shape, ground.headings), 0.2)}]
+
+    level_route = find_route(level, known, (0.15, 0.25), (0.95, 0.25))
+    assert 0.25 < level_route.promise < SURE and level_route.num_headings == 8
     assert known.along(32) is known.along(32)
 
 
