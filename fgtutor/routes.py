@@ -132,7 +132,8 @@ class Route:
         the lower F, the more walks end per metre. F itself is no probability of passing a step but
         a tracking reward, and a product of them falls to 0 on every long route. It was fitted to
         the A1 on one set of maps. On another (open ground of seed 1) the 124 routes that arrived
-        promise 0.87 or more and the 16 that failed 0.10 or less.
+        promise 0.87 or more and the 16 that failed 0.10 or less. Of the toy it says little: of 299
+        drives over its own and mixed ground three failed, of routes that promise 0.79, 1 and 1.
         """
         lengths = np.hypot(*np.diff(self.xy, axis=0).T)
         ends = lengths * np.exp(HAZARD - RELIEF * self.feasibility)

@@ -47,7 +47,7 @@ class PlanSettings:
     least_promise: Promise = 0.25
     """What a route has to promise (`Route.promise`); 0: any will do. A way round the worst steps of
     a route that promises less is looked for, else it is refused. On the grounds by which it was
-    chosen routes of 0.1 or less failed, nearly all of 0.4 or more arrived, none lay between."""
+    chosen routes of 0.1 or less failed and nearly all of 0.4 or more arrived."""
     unknown: Unknown = "block"
     """What to do with unknown cells: "block" closes them, "fill" trusts the filled heights."""
     backend: Backend = "auto"

@@ -219,9 +219,10 @@ def plan_figure(elevation: ElevationMap, plan: Plan, *, f_min: float = 0.1) -> P
         draw_route(plan.answer, elevation, axes=first)
     elif plan.answer.nearest:
         first.plot(*plan.answer.nearest, "X", color=BLOCKED, markersize=11)
-        doubtful = isinstance(plan.answer.error, DoubtfulRouteError)
-        words = "X: the worst step of a route that promises too little"
-        words = words if doubtful else "No route leads nearer to the goal than X"
+        if isinstance(plan.answer.error, DoubtfulRouteError):
+            words = "X: the worst step of a route that promises too little"
+        else:
+            words = "No route leads nearer to the goal than X"
         first.set_title(words, **TITLE, loc="left")
     columns = int(np.ceil(np.sqrt(len(plan.names))))
     rows = -(-len(plan.names) // columns)
