@@ -11,9 +11,10 @@ those on which evaluation measures mixed terrain (`success.make_ground`), undist
 # pyright: reportAttributeAccessIssue=false
 
 import base64
+import itertools
 import shutil
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ VENDOR = {
 CONFIG = TrialsConfig(robot="a1")
 """How evaluation draws grounds and plans over them, by default."""
 GROUNDS = 20
-"""How many grounds the page offers: evaluation's first."""
+"""How many grounds the page offers: the first of evaluation's that have a route."""
 SENSORS = ("foot_position", "trunk_contact")
 """What of `model.SENSORS` the page reads: it tells a fall by them."""
 LENGTHS = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}
@@ -92,10 +93,15 @@ def copy_packages(folder: Path) -> None:
 
 
 def plan_grounds(zoo: Mapping[str, Specialist], count: int) -> list[Planned]:
-    """Plan over the first `count` grounds of mixed terrain, as evaluation does."""
-    grounds = [make_ground(CONFIG, "mixed", index) for index in range(count)]
+    """Plan as evaluation does, over its first `count` mixed grounds that have a route."""
     settings = CONFIG.planning
-    return plan_all(ours, grounds, (one.assess(zoo, settings) for one in grounds), settings)
+
+    def planned() -> Iterator[Planned]:
+        for index in itertools.count():
+            ground = make_ground(CONFIG, "mixed", index)
+            yield from plan_all(ours, [ground], [ground.assess(zoo, settings)], settings)
+
+    return list(itertools.islice((plan for plan in planned() if plan.answer), count))
 
 
 def drive(plans: Sequence[Planned], zoo: Mapping[str, Specialist]) -> list[Trial]:
