@@ -139,6 +139,17 @@ def test_networks_and_patches_agree(node, tmp_path, capsys):
 # The robot --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
+def test_a_ground_without_a_route_is_not_offered(exporter, monkeypatch):
+    zoo, make_ground = load_zoo("a1", include_general=True), exporter.make_ground
+    # Without the gaps specialist the first ground, which has gaps, has no route.
+    short_handed = {name: zoo[name] for name in zoo if name != "gaps"}
+    first, flat = make_ground(exporter.CONFIG, "mixed", 0), make_ground(exporter.CONFIG, "flat", 1)
+    monkeypatch.setattr(exporter, "make_ground", lambda *_: [first, flat][_[-1]])
+    (plan,) = exporter.plan_grounds(short_handed, 1)
+    assert plan.ground is flat and plan.answer
+
+
 def record_episode(exporter: ModuleType) -> list[dict[str, Any]]:
     """Drive the first ground in Python; return the state, what is seen and done, at each step."""
     zoo = load_zoo("a1", include_general=True)
