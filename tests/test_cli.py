@@ -60,6 +60,14 @@ def test_the_spine_loads_no_simulator_and_no_notebook():
     assert fresh(code) == "set()"
 
 
+@pytest.mark.slow
+def test_what_the_workers_of_an_evaluation_import_loads_nothing_to_draw_with():
+    modules = {module for module, _, _ in cli.COMMANDS.values() if module.startswith("evaluation")}
+    code = f"import sys, importlib\nfor name in {sorted(modules)}:\n"
+    code += "    importlib.import_module('fgtutor.' + name)\n"
+    assert fresh(f"{code}print({{'matplotlib', 'scipy.stats'}} & set(sys.modules))") == "set()"
+
+
 def test_a_name_that_is_not_offered_is_an_attribute_error():
     with pytest.raises(AttributeError, match="'teleport'"):
         _ = fgtutor.teleport

@@ -30,7 +30,6 @@ from fgtutor.evaluation.report import Draw, Findings, markdown, run_and_report
 from fgtutor.evaluation.success import terrain_seed
 from fgtutor.evaluation.tasks import Task
 from fgtutor.evaluation.trials import DisturbedConfig, Ground, Outcome, by_cell, drive
-from fgtutor.figures.maps import draw_plans
 from fgtutor.io.validation import Count, check_arguments
 from fgtutor.io.validation import Share as Fraction
 from fgtutor.planning import plan, plan_on_map
@@ -329,6 +328,8 @@ def figures(
     first: Terrain, zoo: Mapping[str, Specialist], config: AdaptationConfig
 ) -> dict[str, Draw]:
     """Return a map with its route for each checkpoint, drawn and as numbers."""
+    from fgtutor.figures.maps import draw_plans  # matplotlib: no worker needs it
+
     plans = find_plans(first, zoo, config)
     picture = draw_plans(
         first.elevation,

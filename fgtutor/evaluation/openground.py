@@ -56,7 +56,6 @@ from fgtutor.evaluation.trials import (
     plan_all,
 )
 from fgtutor.execution import FollowConfig
-from fgtutor.figures.maps import draw_elevation, draw_route
 from fgtutor.io.validation import Unique
 from fgtutor.planning import plan
 from fgtutor.routes import Refusal, Route
@@ -258,6 +257,9 @@ def picture(config: OpenGroundConfig, index: int, rows: Sequence[OpenRow]) -> Dr
     """Return what draws a map with our routes over it, and where their drives failed."""
 
     def draw(path: Path) -> None:
+        # It loads matplotlib, which no worker needs.
+        from fgtutor.figures.maps import draw_elevation, draw_route
+
         zoo, ground = config.load_zoo(), make_ground(config, index)
         elevation = ground.terrain.elevation
         mine = replace(config, planners=(OURS,))
