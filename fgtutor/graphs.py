@@ -142,8 +142,7 @@ def reversed_graph(
     them. Raises `TooLargeError` if the graph does not fit into memory.
     """
     headings, (count, nx, ny, d) = Headings.of(layers), layers.shape
-    # One bit per heading, so that a set of steps is one number.
-    able = np.packbits(layers > 0, axis=-1).view(f"u{d // 8}")
+    able = _as_numbers(layers > 0)
     changes = {
         (old, new): _changes(able[old], able[new]) for old, new in permutations(range(count), 2)
     }
@@ -168,7 +167,7 @@ def reversed_graph(
         for old in (old for old in range(count) if old != new):
             # One more kind of edge stays in the cell and costs nothing but the change.
             inside, along = changes[old, new]
-            leaving = np.unpackbits(along.view(np.uint8), axis=-1).view(bool)
+            leaving = np.unpackbits(along.view(np.uint8), axis=-1, count=d).view(bool)
             there += [_entering(leaving, headings).reshape(-1, d), inside.reshape(-1, 1)]
             tails.append(old * nx * ny + into)
         tail = np.concatenate(tails).astype(np.int32)
@@ -190,6 +189,15 @@ def reversed_graph(
     graph = csr_array((states, states))
     graph.indptr, graph.indices, graph.data = starts, columns, weights
     return graph
+
+
+def _as_numbers(steps: Bool[np.ndarray, "*cells d"]) -> Int[np.ndarray, "*cells 1"]:
+    """Return each set of steps as one number, a bit per heading: 1, 2, 4 or 8 bytes."""
+    packed = np.packbits(steps, axis=-1)
+    size = 1 << (packed.shape[-1] - 1).bit_length()
+    wide = np.zeros((*packed.shape[:-1], size), dtype=np.uint8)
+    wide[..., : packed.shape[-1]] = packed
+    return wide.view(f"u{size}")
 
 
 def _changes(

@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fgtutor import tiles
+from fgtutor.directions import Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError
 from fgtutor.feasibility import FoldedNet
@@ -42,7 +43,7 @@ def stroke(elevation: ElevationMap, rng: np.random.Generator) -> ElevationMap:
 )
 @given(
     shape=st.tuples(st.integers(2, 24), st.integers(2, 16)),
-    headings=st.sampled_from([8, 16, 32]),
+    headings=st.sampled_from([8, 16, 32, 40]),
     resolution=st.sampled_from([0.1, 0.05]),
     seed=st.integers(0, 10**6),
 )
@@ -131,14 +132,14 @@ def test_what_cannot_be_reassessed_is_refused(make_specialist):
             reassess(said, changed)
 
 
-@pytest.mark.parametrize("headings", [8, 16, 32])
+@pytest.mark.parametrize("headings", [8, 16, 32, 40])
 def test_weighing_around_a_cell_gives_what_weighing_the_map_gives(make_specialist, headings):
     elevation = rough(13, 9, np.random.default_rng(2))
     one = assess_all(elevation, {"a": make_specialist("a")}, headings=headings)["a"]
     w_ood, F = one.weigh(0.0, 50.0)
     for cell in np.argwhere(elevation.known).tolist():
         part, at = one.around((cell[0], cell[1]))
-        assert max(part.elevation.shape) <= 9  # the longest step leads four cells on
+        assert max(part.elevation.shape) <= 2 * Headings(headings).moves.max() + 1
         for whole, near in zip((w_ood, F), part.weigh(0.0, 50.0), strict=True):
             assert torch.equal(near[at], whole[tuple(cell)])
         x, y = elevation.centre_of(*cell)

@@ -171,9 +171,12 @@ def _compass(
 ) -> None:
     """Draw something for each heading at the side that it points to, and a map in the middle."""
     image = None
-    # d headings surround a square: 8 one of 1 x 1 panels, 16 one of 3 x 3, 32 one of 7 x 7.
-    far = headings.count // 8
-    across, up = np.rint(far * headings.steps / headings.moves[:, None]).astype(int).T
+    # d headings surround a square: 8 one of 1 x 1 panels, 16 one of 3 x 3, 32 one of 7 x 7. The
+    # first stands at the middle of its right side, the next ones above it.
+    far, d = headings.count // 8, headings.count
+    apart = np.abs((np.arange(d) + d // 2) % d - d // 2)
+    across = np.clip(2 * far - apart, -far, far)
+    up = np.roll(across, d // 4)
     around: list[Axes] = panels[far - up, far + across].tolist()  # rows count down, columns up
     for heading, axes in enumerate(around):
         image = draw(axes, heading)

@@ -5,28 +5,30 @@
  * are flat: cell (ix, iy) stands at ix * ny + iy, its heading k at (ix * ny + iy) * d + k.
  */
 
-/** The headings that a robot may leave a cell along: 8 (the paper's), 16 or 32. */
+/** The steps of each number of headings from +x to before the diagonal. */
+const EIGHTHS = {
+  8: [[1, 0]],
+  16: [[1, 0], [2, 1]],
+  32: [[1, 0], [3, 1], [2, 1], [3, 2]],
+  40: [[1, 0], [6, 1], [3, 1], [2, 1], [4, 3]],
+};
+
+/** The headings that a robot may leave a cell along: 8 (the paper's), 16, 32 or 40. */
 export class Headings {
-  /** @param {8 | 16 | 32} count */
+  /** @param {8 | 16 | 32 | 40} count */
   constructor(count = 8) {
-    if (![8, 16, 32].includes(count)) throw new Error(`there are no ${count} headings`);
+    const eighth = EIGHTHS[count];
+    if (!eighth) throw new Error(`there are no ${count} headings`);
     this.count = count;
+    const mirrored = eighth.slice(1).reverse().map(([a, b]) => [b, a]);
+    const quarter = [...eighth, [1, 1], ...mirrored];
     /** Cell step [dix, diy] of each heading. */
     this.steps = [
-      [1, 0],
-      [0, 1],
-      [-1, 0],
-      [0, -1],
-    ];
-    while (this.steps.length < count) {
-      this.steps = this.steps.flatMap(([a, b], i, all) => {
-        const [c, d] = all[(i + 1) % all.length];
-        return [
-          [a, b],
-          [a + c, b + d],
-        ];
-      });
-    }
+      [1, 0, 0, 1],
+      [0, -1, 1, 0],
+      [-1, 0, 0, -1],
+      [0, 1, -1, 0],
+    ].flatMap(([p, q, r, s]) => quarter.map(([a, b]) => [p * a + q * b, r * a + s * b]));
     /** Yaw of each heading, rad from 0 to 2 pi. */
     this.yaws = this.steps.map(([a, b]) => (Math.atan2(b, a) + 2 * Math.PI) % (2 * Math.PI));
     /** Length of each step in cells. */
