@@ -2,7 +2,7 @@
 
 Headings are ordered counter-clockwise from +x: of eight, heading k points k * 45 degrees, so that
 0 = +x, 2 = +y, 4 = -x, 6 = -y. The opposite of k is k + d / 2, and a quarter turn adds d / 4. This
-is the only file that knows the order; everything else asks it. Sixteen, thirty-two and forty are
+is the only file that knows the order; everything else asks it. Sixteen, thirty-two and forty-eight are
 ours.
 
 A step longer than its neighbours leads over cells between its ends. It passes through those whose
@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int, Num
 
 from fgtutor.errors import ConfigError, PlanningError
 
-HeadingCount = Literal[8, 16, 32, 40]
+HeadingCount = Literal[8, 16, 32, 48]
 """How many headings there can be."""
 Step = tuple[int, int]
 """A difference of cells (dix, diy)."""
@@ -30,10 +30,10 @@ _EIGHTHS: dict[int, tuple[Step, ...]] = {
     8: ((1, 0),),
     16: ((1, 0), (2, 1)),
     32: ((1, 0), (3, 1), (2, 1), (3, 2)),
-    40: ((1, 0), (6, 1), (3, 1), (2, 1), (4, 3)),
+    48: ((1, 0), (6, 1), (3, 1), (2, 1), (3, 2), (5, 4)),
 }
 """The steps of each number of headings from +x to before the diagonal; the others are mirror images
-and turns of them. No direction is further from a heading than 22.5, 13.3, 9.2 and 5.2 degrees."""
+and turns of them. No direction is further from a heading than 22.5, 13.3, 9.2 and 4.8 degrees."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,11 @@ class Headings:
     """
 
     count: HeadingCount = 8
-    """d: 8 (the paper's), 16, 32 or 40."""
+    """d: 8 (the paper's), 16, 32 or 48."""
 
     def __post_init__(self) -> None:
         if self.count not in get_args(HeadingCount):
-            raise ConfigError(f"the number of headings is 8, 16, 32 or 40, got {self.count!r}")
+            raise ConfigError(f"the number of headings is 8, 16, 32 or 48, got {self.count!r}")
 
     @classmethod
     def of(cls, tensor: Any) -> Self:
@@ -60,7 +60,7 @@ class Headings:
         if len(tensor.shape) < 3 or tensor.shape[-1] not in get_args(HeadingCount):
             raise PlanningError(
                 f"the last axis of {tuple(tensor.shape)} does not count headings, of which there "
-                "are 8, 16, 32 or 40: pass what tensorize gave, (nx, ny, 8)"
+                "are 8, 16, 32 or 48: pass what tensorize gave, (nx, ny, 8)"
             )
         return cls(tensor.shape[-1])
 

@@ -36,7 +36,7 @@ def fuse(
     shape = arrays[0].shape
     if len(shape) != 3 or shape[-1] not in get_args(HeadingCount) or not arrays[0].size:
         raise PlanningError(
-            f"tensor 0 has shape {shape}, expected (nx, ny, 8), or 16, 32 or 40 headings: pass "
+            f"tensor 0 has shape {shape}, expected (nx, ny, 8), or 16, 32 or 48 headings: pass "
             "what tensorize gave"
         )
     for index, array in enumerate(arrays):

@@ -83,7 +83,7 @@ class Route:
     names: tuple[str, ...]
     """Names of all policies that were planned with."""
     num_headings: HeadingCount = 8
-    """How many headings `headings` count: 8, 16, 32 or 40."""
+    """How many headings `headings` count: 8, 16, 32 or 48."""
     choices: Float[np.ndarray, "steps policies"] | None = None
     """F_i of every policy at each step, if known."""
     ood: Float[np.ndarray, "steps policies"] | None = None

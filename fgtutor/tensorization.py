@@ -146,7 +146,7 @@ def tensorize(
 ) -> Float[Tensor, "nx ny d"]:
     """Return F_i(x, y, k) = w_ood * f: how well this specialist leaves a cell along heading k.
 
-    `headings` is their number: 8, 16, 32 or 40. `taus` is "calibrated" (the specialist's own),
+    `headings` is their number: 8, 16, 32 or 48. `taus` is "calibrated" (the specialist's own),
     "paper" or a pair (low, high), `unknown` as in `Assessment.weighted`, `progress` shows a bar if
     it takes long.
 

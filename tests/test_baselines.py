@@ -258,7 +258,7 @@ def test_finer_headings_are_tried_where_the_others_find_no_route(known):
 
     ends = (0.15, 0.25), (0.75, 0.55)
     route = find_route(askew, known, *ends)
-    assert route.num_headings == 40 and route.length == pytest.approx(0.3 * math.sqrt(5))
+    assert route.num_headings == 48 and route.length == pytest.approx(0.3 * math.sqrt(5))
     assert find_route(askew, known, *ends, finer_headings=16).num_headings == 16
     assert not find_route(askew, known, *ends, finer_headings=8)
     assert not find_route(askew, known.along(16), (0.15, 0.25), (0.15, 0.75))
@@ -270,11 +270,11 @@ def test_finer_headings_are_tried_where_the_others_find_no_route(known):
         tensor[..., along] = 0.2
         return [{"steps": tensor}]
 
-    # Along the eight a route promises 0.4; along the 32 nearly 1, and that one is taken.
+    # Along the eight a route promises 0.4; along the 48 nearly 1, and that one is taken.
     coarse = find_route(doubtful, known, *ends, finer_headings=8)
     assert coarse.promise == pytest.approx(math.exp(-0.9 * math.exp(HAZARD - RELIEF * 0.2)))
     assert 0.25 < coarse.promise < SURE
-    assert find_route(doubtful, known, *ends).num_headings == 32
+    assert find_route(doubtful, known, *ends).num_headings == 48
     # Where none is surer, or any will do, the first one stands.
     brave = {"least_promise": 0.0}
     assert find_route(doubtful, known, *ends, **brave).num_headings == 8
@@ -284,7 +284,7 @@ def test_finer_headings_are_tried_where_the_others_find_no_route(known):
 
     level_route = find_route(level, known, (0.15, 0.25), (0.95, 0.25))
     assert 0.25 < level_route.promise < SURE and level_route.num_headings == 8
-    assert known.along(32) is known.along(32)
+    assert known.along(48) is known.along(48)
 
 
 def test_planners_are_those_that_the_zoo_allows(assessed):

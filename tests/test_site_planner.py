@@ -12,13 +12,14 @@ import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from browser import Page, run_node, serving
 
 from fgtutor import load_zoo, make_terrain
+from fgtutor.directions import HeadingCount, Headings
 from fgtutor.elevation import ElevationMap
 from fgtutor.execution import execute_batch
 from fgtutor.patches import prepare
@@ -140,7 +141,8 @@ def test_every_stage_agrees_with_python(node, site, zoo, tmp_path, capsys):
         records.append(record)
     assert any("refused" in one for r in records for one in r["settings"]["ours"]["answers"])
     path = tmp_path / "stages.json"
-    path.write_text(json.dumps({"names": list(zoo), "maps": records}))
+    steps = {count: Headings(count).steps.tolist() for count in get_args(HeadingCount)}
+    path.write_text(json.dumps({"names": list(zoo), "maps": records, "steps": steps}))
     run_node(node, "planner.mjs", capsys, SITE=site, RECORDED=path)
 
 

@@ -141,8 +141,8 @@ def test_a_bridge_askew_is_planned_over_without_asking_for_more_headings(monkeyp
     assert refused.fused.shape[-1] == 8
     assert isinstance(refused.answer.error, UnreachableError | DoubtfulRouteError)
     planned = plan_on_map(*given, progress=True)
-    assert planned.fused.shape[-1] == planned.route.num_headings == 40
-    assert "no route along 8 headings: trying 40" in capsys.readouterr().err
+    assert planned.fused.shape[-1] == planned.route.num_headings == 48
+    assert "no route along 8 headings: trying 48" in capsys.readouterr().err
     # Where that many do not fit into memory, the refusal stands.
     monkeypatch.setattr("fgtutor.planning.check_memory", little_memory)
     assert plan_on_map(*given).fused.shape[-1] == 8

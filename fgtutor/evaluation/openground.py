@@ -82,7 +82,7 @@ class OpenGroundConfig(PlannedConfig):
     """Plan and drive over open ground, where tasks have several ways or none."""
 
     finer_headings: HeadingCount | None = None
-    """Headings to try where the others find no sure route (ours 40, the paper's 8: none)."""
+    """Headings to try where the others find no sure route (ours 48, the paper's 8: none)."""
     robot: str = "a1"
     """Which robot."""
     maps: Annotated[int, Interval(ge=1, le=10_000)] = 100

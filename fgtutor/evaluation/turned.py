@@ -56,7 +56,7 @@ class TurnedConfig(DisturbedConfig):
     """Cross one obstacle, turned by some angles."""
 
     finer_headings: HeadingCount | None = None
-    """Headings to try where the others find no sure route (ours 40, the paper's 8: none)."""
+    """Headings to try where the others find no sure route (ours 48, the paper's 8: none)."""
     robot: str = "a1"
     """Which robot."""
     terrains: Annotated[tuple[str, ...], Unique] = ()

@@ -415,7 +415,7 @@ TerrainPainter(wide, steps, start=(1.0, 2.0), goal=(7.0, 2.0))
 #   <details><summary>Answer</summary>The points of the patch lie two cells apart, so the kernel is
 #   dilated: <code>conv2d(..., dilation=2)</code>. And each point lies on a cell's centre still, as
 #   long as the robot does.</details>
-# - `tensorize(big, steps, headings=16)` asks for more headings; there are 8, 16, 32 and 40.
+# - `tensorize(big, steps, headings=16)` asks for more headings; there are 8, 16, 32 and 48.
 #   <details><summary>Answer</summary>Routes may then leave the eight compass directions. The
 #   in-between steps are longer, (2, 1) instead of (1, 0), and as feasible as the worst cell that
 #   they leave.</details>

@@ -537,7 +537,7 @@ compare_routes(corridor.elevation, {"ours": answer, "costmap, raised": refused},
 # - `plan(..., backend="networkx")` searches the graph you have seen. Compare cost and time.
 #   <details><summary>Answer</summary>The same cost up to rounding; the time is much longer, since
 #   each arrow is a Python object.</details>
-# - Tensorize with `headings=16` or `40`, fuse and plan.
+# - Tensorize with `headings=16` or `48`, fuse and plan.
 #   <details><summary>Answer</summary>The route gets shorter where the goal lies between two compass
 #   directions.</details>
 #

@@ -10,12 +10,12 @@ const EIGHTHS = {
   8: [[1, 0]],
   16: [[1, 0], [2, 1]],
   32: [[1, 0], [3, 1], [2, 1], [3, 2]],
-  40: [[1, 0], [6, 1], [3, 1], [2, 1], [4, 3]],
+  48: [[1, 0], [6, 1], [3, 1], [2, 1], [3, 2], [5, 4]],
 };
 
-/** The headings that a robot may leave a cell along: 8 (the paper's), 16, 32 or 40. */
+/** The headings that a robot may leave a cell along: 8 (the paper's), 16, 32 or 48. */
 export class Headings {
-  /** @param {8 | 16 | 32 | 40} count */
+  /** @param {8 | 16 | 32 | 48} count */
   constructor(count = 8) {
     const eighth = EIGHTHS[count];
     if (!eighth) throw new Error(`there are no ${count} headings`);
