@@ -2,8 +2,7 @@
 
 Headings are ordered counter-clockwise from +x: of eight, heading k points k * 45 degrees, so that
 0 = +x, 2 = +y, 4 = -x, 6 = -y. The opposite of k is k + d / 2, and a quarter turn adds d / 4. This
-is the only file that knows the order; everything else asks it. Sixteen, thirty-two and forty-eight are
-ours.
+is the only file that knows the order; everything else asks it. 16, 32 and 48 headings are ours.
 
 A step longer than its neighbours leads over cells between its ends. It passes through those whose
 interior the straight segment from centre to centre meets: touching a corner is not passing, as on a

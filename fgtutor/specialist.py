@@ -19,12 +19,11 @@ from typing import Annotated, Any, Literal
 import safetensors.torch
 import torch
 from annotated_types import Interval
-from rsl_rl.models import MLPModel
-from tensordict import TensorDict
 from torch import Tensor, nn
 
 from fgtutor.errors import FgtutorError, SpecialistError
 from fgtutor.feasibility import FeasibilityNet
+from fgtutor.io.rsl import MLPModel, TensorDict
 from fgtutor.io.storage import beside, remove_leftovers, storage_error
 from fgtutor.io.tensors import CURE, Digest, check_tensors, digest, read_bytes, read_tensors
 from fgtutor.io.validation import (

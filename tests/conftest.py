@@ -16,12 +16,10 @@ import pytest
 import torch
 from browser import chromium, node, page  # noqa: F401  (fixtures for all)
 from hypothesis import settings
-from rsl_rl.models import MLPModel
-from rsl_rl.modules.distribution import GaussianDistribution
-from tensordict import TensorDict
 
 from fgtutor.course import checks
 from fgtutor.feasibility import FeasibilityNet
+from fgtutor.io.rsl import GaussianDistribution, MLPModel, TensorDict
 from fgtutor.patches import PatchGrid
 from fgtutor.robots.toy import ToyEnv
 from fgtutor.specialist import Specialist, save_specialist

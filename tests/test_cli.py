@@ -68,6 +68,21 @@ def test_what_the_workers_of_an_evaluation_import_loads_nothing_to_draw_with():
     assert fresh(f"{code}print({{'matplotlib', 'scipy.stats'}} & set(sys.modules))") == "set()"
 
 
+@pytest.mark.slow
+def test_planning_and_driving_do_not_wait_for_torchs_compiler():
+    modules = {module for module, _, _ in cli.COMMANDS.values()}
+    code = f"import sys, importlib\nfor name in {sorted(modules)}:\n"
+    code += "    importlib.import_module('fgtutor.' + name)\n"
+    code += (
+        "from fgtutor import execute, load_zoo, make_terrain, plan_on_map\n"
+        "zoo, ground = load_zoo('toy'), make_terrain('steps', robot='toy')\n"
+        "route = plan_on_map(ground.elevation, zoo, ground.start, ground.goal).route\n"
+        "assert execute(route, ground, zoo).seconds > 1\n"
+        "print({'torch._dynamo', 'sympy'} & set(sys.modules))"
+    )
+    assert fresh(code) == "set()"
+
+
 def test_a_name_that_is_not_offered_is_an_attribute_error():
     with pytest.raises(AttributeError, match="'teleport'"):
         _ = fgtutor.teleport

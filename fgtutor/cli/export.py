@@ -19,12 +19,11 @@ import onnx
 import torch
 import tyro
 from onnx.reference import ReferenceEvaluator
-from rsl_rl.models import MLPModel
-from tensordict import TensorDict
 from torch import Tensor
 
 from fgtutor.errors import ConfigError, ExportError, SpecialistError
 from fgtutor.io.progress import waiting
+from fgtutor.io.rsl import MLPModel, TensorDict
 from fgtutor.io.storage import atomic_write, check_writable, write_json
 from fgtutor.robots import env_class
 from fgtutor.specialist import Specialist, load_specialist

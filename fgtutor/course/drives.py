@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
 from fgtutor import directions
 from fgtutor.errors import ConfigError
 from fgtutor.execution import Episode, FollowConfig, execute_batch
+from fgtutor.io.rsl import TensorDict
 from fgtutor.io.validation import Positive, check_arguments
 from fgtutor.planning import plan
 from fgtutor.robots.base import LocomotionEnv

@@ -10,13 +10,10 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 import torch
 from annotated_types import Len
-from rsl_rl.models import MLPModel
-from rsl_rl.modules.distribution import GaussianDistribution
-from rsl_rl.utils import resolve_nn_activation
-from tensordict import TensorDict
 from torch import nn
 
 from fgtutor.errors import SpecialistError
+from fgtutor.io.rsl import GaussianDistribution, MLPModel, TensorDict, resolve_nn_activation
 from fgtutor.io.validation import (
     Ascending,
     Name,
@@ -50,6 +47,12 @@ def register_policy(name: str, cls: type[MLPModel]) -> None:
     """
     if POLICIES.setdefault(name, cls) is not cls:
         raise SpecialistError(f"policy class {name!r} is {POLICIES[name]}: choose another name")
+
+
+def _gaussian(*args: Any, **options: Any) -> GaussianDistribution:
+    """Build the action noise on the CPU: for a logarithm on "meta" torch loads its compiler."""
+    with torch.device("cpu"):
+        return GaussianDistribution(*args, **options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +152,7 @@ class PolicyConfig:
             hidden_dims=self.hidden_dims,
             activation=self.activation,
             obs_normalization=self.obs_normalization,
-            # The class itself, and last: rsl_rl imports and calls whatever a text names.
-            distribution_cfg=noise and {**asdict(noise), "class_name": GaussianDistribution},
+            # A function, and last: rsl_rl imports and calls whatever a text names.
+            distribution_cfg=noise and {**asdict(noise), "class_name": _gaussian},
             **self.options,
         )

@@ -15,11 +15,10 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int
-from rsl_rl.models import MLPModel
-from rsl_rl.modules import MLP
 from torch import Tensor, nn
 
 from fgtutor.errors import ConfigError
+from fgtutor.io.rsl import MLP, MLPModel
 from fgtutor.io.validation import Width
 from fgtutor.policies.symmetry import Mirror, SymmetricMLP, SymmetricMLPModel, join
 

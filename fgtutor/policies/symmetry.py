@@ -11,11 +11,10 @@ from typing import Any, Self
 
 import torch
 from jaxtyping import Float
-from rsl_rl.models import MLPModel
-from rsl_rl.modules import MLP
 from torch import Tensor
 
 from fgtutor.errors import ConfigError
+from fgtutor.io.rsl import MLP, MLPModel
 
 
 @dataclass(frozen=True)

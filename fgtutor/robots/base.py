@@ -13,13 +13,12 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from rsl_rl.env import VecEnv
-from tensordict import TensorDict
 from torch import Tensor
 
 from fgtutor import patches
 from fgtutor.errors import ConfigError
 from fgtutor.feasibility import tracking_reward
+from fgtutor.io.rsl import TensorDict, VecEnv
 from fgtutor.io.validation import Count, check_arguments
 from fgtutor.patches import PatchGrid, sample_patches
 from fgtutor.policies.dreamwaq import VELOCITY, History
