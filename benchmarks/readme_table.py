@@ -5,24 +5,44 @@ Reads folders that a `fgtutor evaluate` command has finished; replaces what stan
 policies, planners or terrains, all else being equal, join the first one's table: a specialist that
 has changed need not wait for the others again. Folders of other settings (the paper's beside ours)
 have a table of their own below, under their own caption.
-Use: python benchmarks/readme_table.py NAME FOLDER [FOLDER ...]
+Without folders, the commands of the table are run first: those that docs/results.md shows with
+`# NAME` after them. Interrupted, the same line goes on; a table takes minutes to hours.
+Use: python benchmarks/readme_table.py NAME [FOLDER ...]
 """
 
 import json
 import re
+import shlex
 import sys
 from collections.abc import Sequence, Set
 from functools import reduce
 from pathlib import Path
 from typing import Any
 
+from fgtutor.__main__ import main as fgtutor
 from fgtutor.errors import ReportError
 from fgtutor.evaluation.report import ROWS, RUN, TABLE, markdown
 from fgtutor.io.storage import atomic_write
 
 PAGES = (Path("README.md"), Path("docs/results.md"))
+RUNS = Path("runs/tables")
+"""Where the commands of tables leave their reports."""
 FREE = {"policies", "planners", "terrains", "zoo"}
 """Settings in which folders of one table may differ."""
+
+
+def run(name: str, pages: Sequence[Path]) -> list[Path]:
+    """Run the commands that the pages show for a table; return their report folders."""
+    text = "".join(page.read_text() for page in pages).replace("\\\n", " ")
+    lines = re.findall(rf"^ +fgtutor (.+\S) +# {re.escape(name)}$", text, re.MULTILINE)
+    if not lines:
+        raise ReportError(f"no page shows a command with `# {name}` after it: give its folders")
+    folders = [RUNS / f"{name}-{number}" for number in range(1, len(lines) + 1)]
+    for line, folder in zip(lines, folders, strict=True):
+        print(f"fgtutor {line} --out {folder}", file=sys.stderr)
+        if fgtutor([*shlex.split(line), "--out", str(folder)]):
+            raise ReportError(f"`fgtutor {line}` failed: see above")
+    return folders
 
 
 def fill(pages: Sequence[Path], name: str, block: str) -> None:
@@ -94,12 +114,13 @@ def _check(settings: Sequence[dict[str, Any]], free: Set[str]) -> None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    name, *folders = arguments
-    fill(PAGES, name, block_of([Path(folder) for folder in folders]))
+    name, *given = arguments
+    folders = [Path(folder) for folder in given] or run(name, PAGES)
+    fill(PAGES, name, block_of(folders))
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 3:
+    if len(sys.argv) < 2:
         sys.exit(__doc__)
     try:
         main(sys.argv[1:])

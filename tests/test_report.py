@@ -122,6 +122,28 @@ def test_the_script_writes_the_table_between_its_markers(fill, folder, readme):
         )
 
 
+def test_without_folders_the_commands_of_the_table_are_run(fill, other, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    other.write_text(
+        other.read_text()
+        + "    fgtutor evaluate matrix --robot toy --trials 1 \\\n"
+        + "        --policies steps --terrains flat --workers 1  # mixed\n"
+        + "    fgtutor evaluate matrix --robot toy --trials 1 --terrains mixed  # toy-mixed\n"
+    )
+    fill("mixed")
+    assert "1 trials of `fgtutor evaluate matrix`" in other.read_text()
+    assert [path.name for path in (tmp_path / "runs" / "tables").iterdir()] == ["mixed-1"]
+    with pytest.raises(ReportError, match="no page shows a command with `# matrix` after it"):
+        fill("matrix")
+
+
+def test_every_table_of_the_results_has_its_command():
+    pages = [SCRIPT.parents[1] / page for page in ("README.md", "docs/results.md")]
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
+    tables = set(re.findall(r"<!-- table (\S+) -->", text))
+    assert tables == set(re.findall(r"^ +\S.*  # ([a-z0-9]+-[a-z0-9]+)$", text, re.MULTILINE))
+
+
 def test_the_table_goes_to_the_page_that_has_its_markers(fill, folder, readme, other):
     before = readme.read_text()
     fill("mixed", folder)
