@@ -29,7 +29,7 @@ class PlanSettings:
     taus: Taus = "calibrated"
     """Thresholds of w_ood: "calibrated" (each specialist's own), "paper", or a pair for all."""
     headings: HeadingCount = HEADINGS
-    """d, the number of headings: 8 (the paper's, to the neighbouring cells), 16 or 32."""
+    """d, the number of headings: 8 (the paper's, to the neighbouring cells), 16, 32 or 48."""
     finer_headings: HeadingCount = 48
     """Headings that `plan_on_map` tries where `headings` find no route, or a doubtful one: a bridge
     askew has none along the eight. Not more than `headings`: no others are tried."""

@@ -75,8 +75,8 @@ class TrainConfig:
     """How far robots, sensors and ground differ from one another; wide, of robots that have it, for
     policies that shall hold under disturbance and on other models."""
     gait: Gait = "trot"
-    """How the feet of a robot with legs take turns: in diagonal pairs, or one after another, which
-    suits joints that are damped strongly."""
+    """How the feet of a robot with legs take turns: in diagonal pairs, the same with each standing
+    for longer, or one after another. The last two suit joints that are damped strongly."""
     hours: NonNegative = 0.0
     """Stop and save after this many hours; --resume goes on. 0 sets no limit."""
     iterations: Count = 200
