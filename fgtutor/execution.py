@@ -46,7 +46,8 @@ class FollowConfig:
     goal_radius: Magnitude = 0.35
     """The goal is reached within this distance of it, m."""
     patience: Factor = 3.0
-    """Time limit as a multiple of route length / speed, plus `grace`."""
+    """Time limit as a multiple of the time that the route takes at its policies' speeds, plus
+    `grace`."""
     grace: Factor = 5.0
     """Seconds added to the time limit."""
     stuck_seconds: Unbounded = 10.0
@@ -165,9 +166,6 @@ def execute_batch(
     places = [_places(route, tuple(zoo)) for route in routes]
     specialists = list(zoo.values())
     team = [specialists[place] for place in {place for own in places for place in own.values()}]
-    speed = min(specialist.command[0] for specialist in team)
-    if not speed > 0:
-        raise ConfigError(f"the policies of a route drive ahead, one is commanded {speed} m/s")
     robot = env_class(robots.pop())
     episodes = replace(
         robot.episodes,
@@ -181,7 +179,7 @@ def execute_batch(
     env = robot(World([list(tiles)]), len(routes), config=episodes, **options)
     where = torch.tensor([tiles[terrain] for terrain in terrains])
     tracks = [_Track(route, own) for route, own in zip(routes, places, strict=True)]
-    drive = _Drive(env, where, tracks, specialists, seeds, settings, speed)
+    drive = _Drive(env, where, tracks, specialists, seeds, settings)
     return drive.run(record_body, progress)
 
 
@@ -215,18 +213,14 @@ class _Drive:
         specialists: Sequence[Specialist],
         seeds: Sequence[int],
         config: FollowConfig,
-        speed: float,
     ) -> None:
         self.env, self.specialists, self.config = env, specialists, config
         self.tracks = tracks
         self.corners = env.offsets[0, tiles].cpu().numpy().astype(np.float64)
         self.rngs = [np.random.default_rng(seed) for seed in seeds]
-        self.limits = np.array(
-            [
-                (config.patience * track.length / speed + config.grace) / env.control_dt
-                for track in self.tracks
-            ]
-        )
+        self.speeds = np.array([specialist.command[0] for specialist in specialists])
+        seconds = np.array([track.seconds(self.speeds) for track in tracks])
+        self.limits = (config.patience * seconds + config.grace) / env.control_dt
         n = len(tracks)
         self.error, self.believed_error = np.zeros((2, n, 2))
         self.active = np.array([track.policy for track in self.tracks])
@@ -240,7 +234,7 @@ class _Drive:
             for track, corner, rng in zip(self.tracks, self.corners, self.rngs, strict=True)
         ]
         poses = torch.tensor(np.array(starts), dtype=torch.float32)
-        env.start(torch.arange(n), poses, speed, columns=tiles)
+        env.start(torch.arange(n), poses, torch.zeros(n), columns=tiles)
 
     def run(self, record_body: bool, progress: bool) -> list[Episode]:
         """Step until every robot has reached its goal, fallen or run out of time."""
@@ -296,7 +290,10 @@ class _Drive:
         return pose
 
     def _command(self, pose: Float[np.ndarray, "trials 4"]) -> None:
-        """Command (v, 0, w) by pure pursuit from where each robot believes it is."""
+        """Command (v, 0, w) by pure pursuit from where each robot believes it is.
+
+        v is the planning command of its active policy, and less while it turns.
+        """
         config, n = self.config, len(self.tracks)
         if config.drift or config.position_noise:
             fixes = np.array([rng.standard_normal((2, 2)) for rng in self.rngs])
@@ -315,7 +312,8 @@ class _Drive:
             track.advance(believed[i])
             aims[i] = track.bearing(believed[i], config.lookahead, pose[i, 3])
             self._choose(i, track.policy)
-        wanted, yaw = torch.as_tensor(np.stack((aims, pose[:, 3]))).to(self.env.command)
+        numbers = np.stack((aims, pose[:, 3], self.speeds[self.active]))
+        wanted, yaw, self.env.cruise[:] = torch.as_tensor(numbers).to(self.env.command)
         self.env.steer(wanted, yaw)
 
     def _choose(self, i: int, wanted: int) -> None:
@@ -362,6 +360,11 @@ class _Track:
     def policy(self) -> int:
         """The policy that the route names where the robot is, its place in the zoo."""
         return int(self.policies[self.nearest])
+
+    def seconds(self, speeds: Float[np.ndarray, "policies"]) -> float:
+        """Return the time that it takes at the speeds of its policies, m/s, by their place."""
+        steps = np.hypot(*np.diff(self.points, axis=0).T)
+        return float((steps / speeds[self.policies[:-1]]).sum())
 
     def bearing(self, place: np.ndarray, distance: float, there: float = 0.0) -> float:
         """Return the direction to the point `distance` metres further along, or to the end, rad.

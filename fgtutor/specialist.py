@@ -70,8 +70,8 @@ class Specialist:
     grid: PatchGrid
     """Where its patches are sampled."""
     command: tuple[Speed, Speed, Speed]
-    """Velocity (vx, vy, wz) that planning asks about, in the yaw frame; m/s, m/s, rad/s. It goes
-    ahead, since patches look along the heading."""
+    """Velocity (vx, vy, wz) that planning asks about, and at which it drives a route, in the yaw
+    frame; m/s, m/s, rad/s. It goes ahead, since patches look along the heading."""
     label_seconds: Annotated[float, Interval(ge=0, le=3600)]
     """Seconds over which r_v was averaged into the label; 0 is the paper's instantaneous r_v."""
     quantiles: Mapping[str, float] = field(default_factory=dict)

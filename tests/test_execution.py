@@ -46,6 +46,41 @@ def test_a_toy_reaches_the_end_of_a_straight_route(make_rolling):
     assert episode.body is not None and len(episode.body) == len(episode.poses)
 
 
+def test_each_policy_drives_at_its_own_speed(make_rolling):
+    route, terrain = task((0.5, 2.0), (5.5, 2.0))
+    half = len(route.policies) // 2
+    policies = np.where(np.arange(len(route.policies)) < half, 0, 1)
+    both = replace(route, policies=policies, names=("slow", "fast"))
+    zoo = {
+        name: make_rolling(name, command=(speed, 0.0, 0.0))
+        for name, speed in (("slow", 0.4), ("fast", 1.2))
+    }
+    episode = execute(both, terrain, zoo)
+    assert episode.success and episode.switches == 1
+    x, by = episode.poses[:, 0], episode.policies
+    moved = np.append(0.0, np.diff(x)) * len(x) / episode.seconds
+    slow, fast = (np.median(moved[by == policy]) for policy in (0, 1))
+    assert slow == pytest.approx(0.4, abs=0.05) and fast == pytest.approx(1.2, abs=0.1)
+    assert x[by == 0].max() == pytest.approx(both.xy[half, 0], abs=0.2)
+
+
+def test_the_time_limit_is_that_of_the_speeds_on_the_route(make_rolling):
+    route, terrain = task((0.5, 2.0), (5.5, 2.0))
+    half = len(route.policies) // 2
+    both = replace(
+        route, policies=np.arange(len(route.policies)) // half % 2, names=("slow", "fast")
+    )
+    zoo = {
+        name: make_rolling(name, command=(speed, 0.0, 0.0))
+        for name, speed in (("slow", 0.5), ("fast", 1.0))
+    }
+    # Too little for any of it, and of the time that the route takes, not of the slowest's.
+    late = FollowConfig(patience=0.5, grace=0.0)
+    episode = execute(both, terrain, zoo, config=late)
+    assert episode.reason == "timeout"
+    assert episode.seconds == pytest.approx(0.5 * (2.5 / 0.5 + 2.5 / 1.0), abs=0.15)
+
+
 @pytest.mark.parametrize("goal", [(4.0, 3.5), (1.0, 3.6), (4.5, 0.6)])
 def test_it_follows_bends(make_rolling, goal):
     route, terrain = task((1.5, 2.0), goal)

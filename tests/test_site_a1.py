@@ -162,10 +162,7 @@ def record_episode(exporter: ModuleType) -> list[dict[str, Any]]:
     places = {i: names.index(name) for i, name in enumerate(route.names)}
     track = _Track(route, places)
     follow = FollowConfig(hold_steps=exporter.CONFIG.planning.hold_steps)
-    speed = zoo["steps"].command[0]
-    drive = _Drive(
-        env, torch.tensor([0]), [track], [*zoo.values()], plan.ground.seeds, follow, speed
-    )
+    drive = _Drive(env, torch.tensor([0]), [track], [*zoo.values()], plan.ground.seeds, follow)
     steps: list[dict[str, Any]] = []
     act, fallen = drive._act, env.fallen
 

@@ -14,9 +14,16 @@ import torch
 from fgtutor.errors import CheckpointError, ConfigError, StorageError
 from fgtutor.feasibility import FeasibilityNet, feasibility_labels
 from fgtutor.learning.checkpoints import read_checkpoint, write_checkpoint
-from fgtutor.learning.config import A1TrainConfig, TrainConfig, config_of, training_world
+from fgtutor.learning.config import (
+    A1TrainConfig,
+    TrainConfig,
+    config_of,
+    make_training_env,
+    training_world,
+)
 from fgtutor.learning.trainer import Trainer
 from fgtutor.learning.training import train
+from fgtutor.robots.toy import ToyEnv
 from fgtutor.specialist import load_specialist, save_specialist
 
 TINY = {
@@ -377,6 +384,11 @@ def test_ctrl_c_saves_and_returns_what_was_learned(tmp_path):
         ({"hidden": (8, 0)}, "hidden: 1: should be greater than or equal to 1"),
         ({"label_seconds": float("inf")}, "label_seconds: should be a finite number"),
         ({"planning_speed": 0.0}, "planning_speed: should be greater than 0"),
+        ({"speed": (0.9, 0.5)}, "speed: .*got"),
+        (
+            {"speed": (0.3, 0.6)},
+            r"planning_speed should lie between .* 0\.3 and 0\.6 m/s, got 0\.85",
+        ),
         ({"threads": 100_000}, "threads: should be less than or equal to 256"),
         ({"hours": float("nan")}, "hours: should be a finite number"),
         ({"easiest": 1.5}, r"easiest: should be less than or equal to 1, got 1\.5"),
@@ -403,6 +415,14 @@ def test_a_device_that_is_not_there_is_named_with_those_that_are(tmp_path):
 def test_a_rollout_too_short_for_its_label_is_refused():
     with pytest.raises(ConfigError, match="steps to 14 or more"):
         Trainer(TrainConfig(**TINY | {"label_seconds": 1.0}))
+
+
+def test_robots_train_at_the_speeds_asked_for():
+    config = TrainConfig(**TINY | {"num_envs": 100}, speed=(0.2, 0.5), planning_speed=0.4)
+    speeds = make_training_env(config).cruise
+    assert 0.2 <= speeds.min() < 0.25 and 0.45 < speeds.max() <= 0.5
+    usual = make_training_env(TrainConfig(**TINY)).cruise
+    assert usual.min() >= ToyEnv.episodes.speed[0]
 
 
 def test_the_generalist_trains_on_every_specialty():

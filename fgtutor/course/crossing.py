@@ -55,8 +55,7 @@ def driven(own: Stages, route: Route) -> tuple[Episode, dict[str, np.ndarray]]:
     episodes = replace(robot.episodes, train=False, stuck_seconds=math.inf)
     env = robot(World([[corridor()]]), 1, config=episodes)
     corner = env.offsets[0, 0].numpy().astype(float)
-    speed = min(specialist.command[0] for specialist in specialists)
-    env.start(torch.arange(1), torch.tensor([[*(route.xy[0] + corner), 0.0]]).float(), speed)
+    env.start(torch.arange(1), torch.tensor([[*(route.xy[0] + corner), 0.0]]).float(), 0.0)
     seen: dict[str, list] = {"pose": [], "policy": [], "velocity": [], "command": []}
     wanted: list[int] = []
     limit = env.config.max_turn_rate
@@ -88,6 +87,7 @@ def driven(own: Stages, route: Route) -> tuple[Episode, dict[str, np.ndarray]]:
             lambda f, history=history: same_shape(f(history, config.hold_steps), history),
         )
         policy = int(active[-1])
+        speed = specialists[policy].command[0]
         env.command[0, 0] = speed * float(slowdown(*both, env.config.slowest))
         env.command[0, 2] = float(rate[0])
         with torch.inference_mode():

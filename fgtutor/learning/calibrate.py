@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
@@ -28,11 +28,13 @@ from fgtutor.feasibility import (
     feasibility_labels,
 )
 from fgtutor.io.validation import Count, CountOrZero, Seed, Share, Width, check_fields
-from fgtutor.learning.config import training_tile
+from fgtutor.learning.config import Speed, training_tile
 from fgtutor.learning.refit import refitted
 from fgtutor.robots import ROBOTS, env_class
 from fgtutor.specialist import GENERAL, Specialist, load_specialist, save_specialist
 from fgtutor.world.terrain import Terrain, World
+
+T = TypeVar("T")
 
 HELD_OUT = 2**40
 """Where the seeds of calibration terrain begin: odd, so never trained on, and beyond the seeds of
@@ -66,6 +68,9 @@ class CalibrateConfig:
     easiest: Share = 0.85
     """Difficulty of the easiest terrain that it is fitted to: on easy ground, every specialist is
     at home. Less makes more ground familiar."""
+    planning_speed: Speed | None = None
+    """Forward speed at which the policy walks a route from now on, and which planning pairs with
+    every patch, m/s, one that it was trained with; default: as it is."""
     worlds: Count = 4
     """Training worlds that the patches for the new one come from."""
     envs: Annotated[int, Interval(ge=1, le=10_000)] = 100
@@ -116,7 +121,9 @@ def roll_out(
     `options` go to the robot's environment.
     """
     make = env_class(specialist.robot)
-    episodes = replace(make.episodes, history=specialist.history)
+    episodes = replace(
+        make.episodes, history=specialist.history, speed=speeds_trained_with(specialist)
+    )
     env = make(World([tiles]), num_envs, config=episodes, seed=seed, **(options or {}))
     std = torch.zeros(env.num_actions)
     if noise:
@@ -147,7 +154,7 @@ def own_terrain(
     """
     kind = str(specialist.provenance.get("terrain", specialist.name))
     mixed = ROBOTS[specialist.robot].scale.mixed
-    between, turned = (_trained_with(specialist, name) for name in ("neighbours", "turned"))
+    between, turned = (_trained_with(specialist, name, 0.0) for name in ("neighbours", "turned"))
     rng = np.random.default_rng(first)
     return [
         training_tile(
@@ -163,11 +170,17 @@ def own_terrain(
     ]
 
 
-def _trained_with(specialist: Specialist, setting: str) -> float:
-    """Return a share that a specialist was trained with; 0 if its provenance does not say."""
+def speeds_trained_with(specialist: Specialist) -> tuple[float, ...]:
+    """Return the range of forward speeds that a specialist was told in training, m/s."""
+    usual = [*env_class(specialist.robot).episodes.speed]
+    return tuple(_trained_with(specialist, "speed", usual))
+
+
+def _trained_with(specialist: Specialist, setting: str, default: T) -> T:
+    """Return what a specialist was trained with; the default if its provenance does not say."""
     training = specialist.provenance.get("config")
-    share = training.get(setting, 0.0) if isinstance(training, dict) else 0.0
-    return share if isinstance(share, float) else 0.0
+    value = training.get(setting) if isinstance(training, dict) else None
+    return value if isinstance(value, type(default)) else default
 
 
 @torch.no_grad()
@@ -201,8 +214,17 @@ def met_in_training(specialist: Specialist, config: CalibrateConfig) -> Rollout:
 def calibrated(specialist: Specialist, config: CalibrateConfig) -> Specialist:
     """Return the specialist with quantiles measured on held-out terrain of full difficulty.
 
-    With `config.updates`, its Feasibility-Net is fitted anew before.
+    With `config.updates`, its Feasibility-Net is fitted anew before. Raises `ConfigError` if it was
+    never trained at `config.planning_speed`.
     """
+    if config.planning_speed:
+        slowest, fastest = speeds_trained_with(specialist)
+        if not slowest <= config.planning_speed <= fastest:
+            raise ConfigError(
+                f"{specialist.name} was trained with {slowest:g} to {fastest:g} m/s: choose a "
+                f"planning speed between them, got {config.planning_speed:g}"
+            )
+        specialist = replace(specialist, command=(config.planning_speed, *specialist.command[1:]))
     if config.updates:
         specialist = replace(
             specialist,
@@ -214,9 +236,11 @@ def calibrated(specialist: Specialist, config: CalibrateConfig) -> Specialist:
     note = {
         "calibration": {
             "patches": len(held_out.distinctive),
-            **{name: getattr(config, name) for name in ("updates", "envs", "seconds", "seed")},
+            **{name: getattr(config, name) for name in ("envs", "seconds", "seed")},
         }
     }
+    if config.updates:
+        note["refit"] = {"updates": config.updates, "seed": config.seed}
     return replace(
         specialist,
         quantiles=quantiles,

@@ -17,7 +17,15 @@ import tyro
 from annotated_types import Interval, MinLen
 
 from fgtutor.errors import ConfigError
-from fgtutor.io.validation import Count, CountOrZero, NonNegative, Seed, Share, check_fields
+from fgtutor.io.validation import (
+    Ascending,
+    Count,
+    CountOrZero,
+    NonNegative,
+    Seed,
+    Share,
+    check_fields,
+)
 from fgtutor.learning.ppo import FeasibilityPPO
 from fgtutor.policies.dreamwaq import HISTORY, LONGER, DreamWaQModel, EstimatingModel
 from fgtutor.policies.symmetry import SymmetricMLPModel
@@ -110,8 +118,11 @@ class TrainConfig:
     turned: Share = 0.0
     """Share of terrains whose obstacle lies at any angle, as on open ground; then all terrains are
     square."""
+    speed: Annotated[tuple[Speed, Speed], Ascending] | None = None
+    """Range of the commanded forward speed, m/s; default: the robot's own."""
     planning_speed: Speed = 0.85
-    """Forward speed of the command that planning pairs with every patch, m/s."""
+    """Forward speed at which the policy walks a route, and which planning pairs with every patch,
+    m/s."""
     hidden: Widths = (128, 64)
     """Hidden widths of actor and critic."""
     gamma: Share = 0.98
@@ -137,6 +148,11 @@ class TrainConfig:
         check_fields(self)
         if self.std_at_last is not None and self.easiest_at_last is None:
             raise ConfigError("std_at_last needs easiest_at_last, as it falls while that rises")
+        if self.speed and not self.speed[0] <= self.planning_speed <= self.speed[1]:
+            raise ConfigError(
+                f"planning_speed should lie between the speeds trained with, {self.speed[0]:g} and "
+                f"{self.speed[1]:g} m/s, got {self.planning_speed:g}"
+            )
         if not re.fullmatch(r"cpu|cuda(:[0-9]{1,3})?", self.device):
             raise ConfigError(f"device should be cpu, cuda or cuda:NUMBER, got {self.device!r}")
         try:
@@ -201,6 +217,7 @@ def comparable(config: TrainConfig) -> dict[str, Any]:
     for name in ("out", "resume", "hours", "threads", "device"):
         del values[name]
     values["hidden"] = list(values["hidden"])
+    values["speed"] = list(config.speed) if config.speed else None
     values["start_from"] = str(config.start_from) if config.start_from else None
     return values
 
@@ -279,6 +296,7 @@ def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
         config.num_envs,
         config=dataclasses.replace(
             make.episodes,
+            speed=config.speed or make.episodes.speed,
             history=FRAMES.get(config.actor, 0),
             oblique=config.disturbances == "wide",
         ),

@@ -187,7 +187,6 @@ def describe_robot(scene: mujoco.MjModel, zoo: Mapping[str, Specialist]) -> dict
         "slowest": A1_EPISODES.slowest,
         "max_turn_rate": A1_EPISODES.max_turn_rate,
         "history": max(specialist.history for specialist in zoo.values()),
-        "speed": min(specialist.command[0] for specialist in zoo.values()),
         "policies": [
             {"name": name, "colour": colour} for name, colour in policy_colours(list(zoo)).items()
         ],

@@ -20,7 +20,7 @@ export class Walk {
     const policies = only ? ground.route.policies.map(() => 0) : ground.route.policies;
     this.track = new Track(ground.route.xy, policies);
     this.follower = new Follower(this.track, {
-      speed: robot.speed,
+      speeds: this.names.map((name) => zoo.get(name).command[0]),
       dt: robot.control_dt,
       slowest: robot.slowest,
       maxTurnRate: robot.max_turn_rate,

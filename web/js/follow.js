@@ -14,7 +14,7 @@ export const FOLLOW = {
   lookahead: 0.45,
   /** The goal is reached within this distance of it, m. */
   goalRadius: 0.35,
-  /** Time limit as a multiple of route length / speed, plus `grace`. */
+  /** Time limit as a multiple of the route's time at its policies' speeds, plus `grace`. */
   patience: 3,
   /** Seconds added to the time limit. */
   grace: 5,
@@ -68,6 +68,16 @@ export class Track {
     return this.points.at(-1);
   }
 
+  /** Return the time that it takes at the speeds of its policies, m/s. */
+  seconds(speeds) {
+    let total = 0;
+    for (let i = 1; i < this.points.length; i++) {
+      const [[x0, y0], [x1, y1]] = [this.points[i - 1], this.points[i]];
+      total += hypot(x1 - x0, y1 - y0) / speeds[this.policies[i - 1]];
+    }
+    return total;
+  }
+
   /**
    * Return the direction to the point `distance` metres further along, or to the end, rad;
    * `there` is the answer where the place is that point.
@@ -97,9 +107,9 @@ export class Track {
 export class Follower {
   /**
    * @param {Track} track
-   * @param {{speed: number, dt: number, slowest: number, maxTurnRate: number}} robot - Its speed,
-   *   m/s, the seconds between two actions, the least share of its speed at which it turns, and
-   *   its greatest turn rate, rad/s.
+   * @param {{speeds: number[], dt: number, slowest: number, maxTurnRate: number}} robot - Its
+   *   speed with each policy, m/s, the seconds between two actions, the least share of its speed at
+   *   which it turns, and its greatest turn rate, rad/s.
    * @param {typeof FOLLOW} config
    */
   constructor(track, robot, config = FOLLOW) {
@@ -110,7 +120,7 @@ export class Follower {
     this.active = track.policy;
     this.waiting = 0;
     this.steps = 0;
-    this.limit = (config.patience * track.length) / robot.speed + config.grace;
+    this.limit = config.patience * track.seconds(robot.speeds) + config.grace;
   }
 
   /**
@@ -124,7 +134,7 @@ export class Follower {
     track.advance(place);
     const wanted = track.bearing(place, config.lookahead, yaw);
     this.choose(track.policy);
-    const vx = robot.speed * slowdown(wanted, yaw, robot.slowest);
+    const vx = robot.speeds[this.active] * slowdown(wanted, yaw, robot.slowest);
     return [vx, 0, turnRate(wanted, yaw, robot.maxTurnRate)];
   }
 

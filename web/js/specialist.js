@@ -17,7 +17,8 @@ const VELOCITY = 3;
  * @typedef {object} Specialist
  * @property {string} name
  * @property {string} robot
- * @property {number[]} command - The velocity (vx, vy, wz) that planning asks about.
+ * @property {number[]} command - The velocity (vx, vy, wz) that planning asks about, and at which
+ *   a route is driven.
  * @property {object} grid - Where its patches are sampled; see `PatchGrid` in heights.js.
  * @property {Record<string, number>} quantiles - Of L_recon on its own terrain, by probability.
  * @property {Record<string, number>} strangeness - Quantiles of the strangeness there.

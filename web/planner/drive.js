@@ -26,9 +26,8 @@ export class Drive {
     this.offset = world.offset;
     this.toy = new Toy(munk, world);
     const track = new Track(route.xy, route.policies);
-    const team = [...new Set(route.policies.length ? route.policies : [0])];
-    const speed = Math.min(...team.map((i) => zoo[i].command[0]));
-    const robot = { speed, dt: CONTROL_DT, slowest: 1, maxTurnRate: MAX_TURN_RATE };
+    const speeds = zoo.map(({ command }) => command[0]);
+    const robot = { speeds, dt: CONTROL_DT, slowest: 1, maxTurnRate: MAX_TURN_RATE };
     this.follower = new Follower(track, robot, FOLLOW);
     const [x, y] = track.points[0].map((value) => value + NOISE * random());
     const yaw = track.bearing(track.points[0], FOLLOW.lookahead) + NOISE * random();
