@@ -331,17 +331,6 @@ def test_a_walking_trot_keeps_diagonal_feet_together_and_lifts_them_for_less():
     assert torch.allclose(share.roll(100, 0), share[:, [1, 0, 3, 2]], atol=1e-5)
 
 
-def test_a_walk_swings_one_foot_at_a_time_and_is_its_own_mirror_image():
-    share = rewards.stance_share(torch.arange(200) / 200, "walk")
-    swinging = share < 0.5
-    assert swinging.sum(dim=-1).max() == 2 and (share < 0.1).sum(dim=-1).max() == 1
-    assert (~swinging).float().mean(dim=0).tolist() == pytest.approx([0.7] * 4, abs=0.02)
-    # RL, FL, RR, FR: hind foot, front foot of that side, then the other side.
-    middle = share.argmin(dim=0)
-    assert torch.argsort((middle - middle[3]) % 200).tolist() == [3, 1, 2, 0]
-    assert torch.allclose(share.roll(100, 0), share[:, [1, 0, 3, 2]])
-
-
 @pytest.mark.parametrize(
     ("stance", "force", "slide", "clearance", "expected"),
     [

@@ -504,8 +504,8 @@ def test_an_estimating_run_starts_from_a_shipped_policy_and_resumes_exactly(tmp_
 
 
 def test_a_robot_without_legs_knows_no_gait(tmp_path):
-    with pytest.raises(ConfigError, match="toy knows no gait to walk in"):
-        Trainer(tiny(tmp_path, gait="walk"))
+    with pytest.raises(ConfigError, match="toy has no gaits: leave walking-trot out"):
+        Trainer(tiny(tmp_path, gait="walking-trot"))
 
 
 @pytest.mark.slow

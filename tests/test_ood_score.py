@@ -15,6 +15,7 @@ from fgtutor.learning.calibrate import (
     met_in_training,
     own_terrain,
     quantiles_on,
+    roll_out,
 )
 from fgtutor.learning.training import TrainConfig, train
 from fgtutor.specialist import ZOO, load_specialist, save_specialist
@@ -122,6 +123,24 @@ def test_a_specialist_is_calibrated_on_ground_as_it_was_trained_on(make_speciali
     askew = [one for one in square if abs(one.goal[1] - one.start[1]) > 1e-6]
     assert 10 <= len(askew) <= 30
     assert {one.name for one in square} == {"steps"}
+
+
+def test_another_planning_speed_is_one_that_it_was_trained_with(make_rolling, config):
+    rolling = make_rolling("steps")
+    slower = calibrated(rolling, replace(config, planning_speed=0.75))
+    assert slower.command == (0.75, 0.0, 0.0)
+    assert slower.strangeness == calibrated(rolling, config).strangeness
+    with pytest.raises(ConfigError, match=r"trained with 0\.7 to 1 m/s: .*, got 0\.5"):
+        calibrated(rolling, replace(config, planning_speed=0.5))
+    slow = make_rolling("steps", provenance={"config": {"speed": [0.2, 0.6]}})
+    assert calibrated(slow, replace(config, planning_speed=0.5)).command[0] == 0.5
+
+
+def test_it_is_driven_at_speeds_as_in_training(make_rolling, config):
+    tiles = own_terrain(make_rolling("steps"), 2, 1)
+    slow = make_rolling("steps", provenance={"config": {"speed": [0.2, 0.3]}})
+    assert roll_out(slow, tiles, 8, 1.2).command[:, 0].max() <= 0.3
+    assert roll_out(make_rolling("steps"), tiles, 8, 1.2).command[:, 0].max() > 0.7
 
 
 def test_a_new_autoencoder_knows_its_terrain_better(make_rolling, config):

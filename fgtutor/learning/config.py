@@ -83,8 +83,8 @@ class TrainConfig:
     """How far robots, sensors and ground differ from one another; wide, of robots that have it, for
     policies that shall hold under disturbance and on other models."""
     gait: Gait = "trot"
-    """How the feet of a robot with legs take turns: in diagonal pairs, the same with each standing
-    for longer, or one after another. The last two suit joints that are damped strongly."""
+    """How the feet of a robot with legs take turns: in diagonal pairs, or the same with each
+    standing for longer, which suits joints that are damped strongly."""
     hours: NonNegative = 0.0
     """Stop and save after this many hours; --resume goes on. 0 sets no limit."""
     iterations: Count = 200
@@ -289,7 +289,7 @@ def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
     settings = make.disturbances[config.disturbances]
     if config.gait != "trot":
         if not hasattr(settings, "gait"):
-            raise ConfigError(f"{config.robot} knows no gait to {config.gait} in: leave it out")
+            raise ConfigError(f"{config.robot} has no gaits: leave {config.gait} out")
         settings = dataclasses.replace(settings, gait=config.gait)
     return make(
         training_world(config, iteration),

@@ -29,8 +29,8 @@ from fgtutor.world.terrain import TerrainSeed, World
 
 Layout = tuple[list[dict[str, Any]], dict[str, Any]]
 """The parts of the observation in order (see `part`), and what an action means."""
-Gait = Literal["trot", "walking-trot", "walk"]
-"""How feet take turns: in diagonal pairs, the same with each standing for longer, or one by one."""
+Gait = Literal["trot", "walking-trot"]
+"""How feet take turns: in diagonal pairs, or the same with each standing for longer."""
 
 
 def plain_tensors(method: Callable[..., Any]) -> Callable[..., Any]:

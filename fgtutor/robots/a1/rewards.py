@@ -22,12 +22,10 @@ from fgtutor.robots.base import Gait
 GAITS: dict[Gait, tuple[tuple[float, ...], float]] = {
     "trot": ((0.0, 0.5, 0.5, 0.0), 0.0),
     "walking-trot": ((0.0, 0.5, 0.5, 0.0), 0.6),
-    "walk": ((0.125, 0.625, 0.375, 0.875), 0.6),
 }
 """By how much of a gait cycle each leg is ahead, and what keeps feet on the ground for longer than
 half of it: a trot moves diagonal legs together; so does a walking trot, whose feet stand for 0.7 of
-the cycle; a walk moves a hind leg, the front leg of its side, then those of the other side, each
-standing for 0.7 of the cycle, too."""
+the cycle."""
 POSTURE = (3.0, 0.1, 0.1) * 4
 """How much each joint's distance from `NARROW` counts: legs may bend, but not spread."""
 NARROW = (0.2, 0.0, 0.0, -0.2, 0.0, 0.0) * 2
