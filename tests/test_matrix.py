@@ -351,7 +351,8 @@ def test_disturbed_tables_say_so_and_are_other_runs(config, capsys):
         for flag, name in ((False, "plain"), (True, "hurt"))
     )
     run(plain)
-    assert "; undisturbed; told its exact velocity and the true heights" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "; undisturbed; gaps, general, steps at 0.85 m/s; told its exact velocity" in said
     run(hurt)
     assert "friction 0.8, 2 kg more" in capsys.readouterr().out
     assert "disturbed" in (hurt.out / "table.md").read_text().splitlines()[0]

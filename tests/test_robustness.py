@@ -142,7 +142,7 @@ def test_the_command_drives_every_level_reports_and_resumes(config, capsys, monk
     text = (config.out / "table.md").read_text()
     assert "| undisturbed | - | 100 (21-100) | yes |" in text
     assert "Highest level passed, after all milder ones: low-damping x 0.5." in text
-    assert "undisturbed; told its exact velocity" in text and "Worst: " in text
+    assert " at 0.85 m/s; told its exact velocity" in text and "Worst: " in text
     assert len(text.strip().split("\n\n")) == 3
     stored = json.loads((config.out / "run.json").read_text())["settings"]["conditions"]
     changes = stored["changes"]["low-friction"]["x 0.4"]["model"]

@@ -165,7 +165,7 @@ def test_the_command_drives_reports_and_resumes(config, capsys, monkeypatch):
         assert lengths["ours", 0.05, 0.02, seed] > lengths["ours", 0.0, 0.0, seed]
     text = (config.out / "table.md").read_text()
     assert "| 5 + 2 | follower | + all | 100 (34-100) | 0 | 0 | 0 | 0.0 |" in text
-    assert "undisturbed; told its exact velocity and the true heights around it" in text
+    assert " at 0.85 m/s; told its exact velocity and the true heights around it" in text
     assert "8 trials in all" in text and "hysteresis of 3 steps" in text
     figures = sorted(path.name for path in (config.out / "figures").iterdir())
     assert figures == ["success-0-0.svg", "success-5-2.svg"]

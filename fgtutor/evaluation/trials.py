@@ -61,9 +61,14 @@ class ZooConfig(RunConfig):
         return load_zoo(self.robot, self.home, include_general=True)
 
     def told(self, condition: Condition) -> str:
-        """Say what is amiss and what the policies know of their motion, for a caption."""
-        said = f"{condition.words}; told {condition.told}"
-        blind = [name for name, specialist in self.load_zoo().items() if specialist.history]
+        """Say what is amiss, how fast policies drive and what they know of it, for a caption."""
+        zoo = self.load_zoo()
+        paces: dict[float, list[str]] = {}
+        for name, specialist in zoo.items():
+            paces.setdefault(specialist.command[0], []).append(name)
+        each = ", ".join(f"{', '.join(paces[pace])} at {pace:g} m/s" for pace in sorted(paces))
+        said = f"{condition.words}; {each}; told {condition.told}"
+        blind = [name for name, specialist in zoo.items() if specialist.history]
         if not blind:
             return said
         estimate = "estimate" if len(blind) > 1 else "estimates"
