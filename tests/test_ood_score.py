@@ -134,6 +134,9 @@ def test_another_planning_speed_is_one_that_it_was_trained_with(make_rolling, co
         calibrated(rolling, replace(config, planning_speed=0.5))
     slow = make_rolling("steps", provenance={"config": {"speed": [0.2, 0.6]}})
     assert calibrated(slow, replace(config, planning_speed=0.5)).command[0] == 0.5
+    odd = make_rolling("steps", provenance={"config": {"speed": [0.5]}})
+    with pytest.raises(ConfigError, match="speed"):
+        calibrated(odd, replace(config, planning_speed=0.5))
 
 
 def test_it_is_driven_at_speeds_as_in_training(make_rolling, config):

@@ -69,7 +69,7 @@ class CalibrateConfig:
     """Difficulty of the easiest terrain that it is fitted to: on easy ground, every specialist is
     at home. Less makes more ground familiar."""
     planning_speed: Speed | None = None
-    """Forward speed at which the policy walks a route from now on, and which planning pairs with
+    """Forward speed at which the policy drives a route from now on, and which planning pairs with
     every patch, m/s, one that it was trained with; default: as it is."""
     worlds: Count = 4
     """Training worlds that the patches for the new one come from."""
@@ -170,10 +170,14 @@ def own_terrain(
     ]
 
 
-def speeds_trained_with(specialist: Specialist) -> tuple[float, ...]:
-    """Return the range of forward speeds that a specialist was told in training, m/s."""
-    usual = [*env_class(specialist.robot).episodes.speed]
-    return tuple(_trained_with(specialist, "speed", usual))
+def speeds_trained_with(specialist: Specialist) -> tuple[float, float]:
+    """Return the range of forward speeds that a specialist was told in training, m/s.
+
+    Raises `ConfigError` if its provenance gives something else.
+    """
+    usual = env_class(specialist.robot).episodes
+    told = _trained_with(specialist, "speed", [*usual.speed])
+    return replace(usual, speed=tuple(told)).speed
 
 
 def _trained_with(specialist: Specialist, setting: str, default: T) -> T:

@@ -121,7 +121,7 @@ class TrainConfig:
     speed: Annotated[tuple[Speed, Speed], Ascending] | None = None
     """Range of the commanded forward speed, m/s; default: the robot's own."""
     planning_speed: Speed = 0.85
-    """Forward speed at which the policy walks a route, and which planning pairs with every patch,
+    """Forward speed at which the policy drives a route, and which planning pairs with every patch,
     m/s."""
     hidden: Widths = (128, 64)
     """Hidden widths of actor and critic."""
