@@ -117,6 +117,8 @@ def test_values_of_several_words_and_paths(config):
         "steps-hidden-8_4-1": (8, 4),
         "steps-hidden-16-1": (16,),
     }
+    speeds = trainings(replace(config, seeds=(1,), vary=("speed", "0.5 0.9", "0.6 1.0")))
+    assert [train.speed for _, train in speeds.values()] == [(0.5, 0.9), (0.6, 1.0)]
     actors = trainings(replace(config, seeds=(1,), vary=("actor", "perceptive", "dreamwaq")))
     assert [train.actor for _, train in actors.values()] == ["perceptive", "dreamwaq"]
 
@@ -163,7 +165,7 @@ def test_settings_that_cannot_work_are_refused(config, changes, message):
     ("changes", "error", "message"),
     [
         ({"vary": ("gamma", "0.9", "0.9")}, ConfigError, "asked twice"),
-        ({"vary": ("speed", "1")}, ConfigError, "cannot vary speed: `fgtutor train --help`"),
+        ({"vary": ("pace", "1")}, ConfigError, "cannot vary pace: `fgtutor train --help`"),
         ({"vary": ("gamma", "much")}, ConfigError, "--gamma much: .* valid number"),
         (
             {"vary": ("iterations", "0")},

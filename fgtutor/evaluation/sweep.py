@@ -15,7 +15,7 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, Any, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from annotated_types import Interval, MinLen
@@ -162,7 +162,8 @@ def _with(config: TrainConfig, option: str, value: str) -> TrainConfig:
     kind = get_type_hints(type(config)).get(name)
     if kind is None:
         raise ConfigError(f"cannot vary {option}: `fgtutor train --help` says what can be set")
-    words = value.split() if get_origin(kind) is tuple else value
+    several = tuple in [get_origin(one) for one in (kind, *get_args(kind))]  # perhaps or None
+    words = value.split() if several else value
     try:
         read = TypeAdapter(kind).validate_python(words)
     except ValidationError as error:
