@@ -9,7 +9,7 @@ from fgtutor.baselines import ours
 from fgtutor.errors import ConfigError, ReportError, SpecialistError, TerrainError
 from fgtutor.evaluation import ablation, success
 from fgtutor.evaluation.ablation import AblationConfig
-from fgtutor.evaluation.cost import Cost
+from fgtutor.evaluation.cost import Cost, estimate
 from fgtutor.evaluation.matrix import MatrixConfig, forced, policies, run, table, walk_task
 from fgtutor.evaluation.shards import collect
 from fgtutor.evaluation.success import (
@@ -362,3 +362,17 @@ def test_disturbed_tables_say_so_and_are_other_runs(config, capsys):
     assert stored["model"]["friction"] == 0.8
     with pytest.raises(ReportError, match="condition was"):
         run(replace(hurt, disturbed=False))
+
+
+def test_the_time_to_drive_is_that_of_the_slowest_policy(make_rolling):
+    ground = make_terrain("flat", robot="toy", seed=1)
+
+    def seconds(other: float) -> float:
+        zoo = {
+            name: make_rolling(name, command=(speed, 0.0, 0.0))
+            for name, speed in (("first", 1.0), ("other", other))
+        }
+        return estimate(zoo, [ground], grounds=0, episodes=100).seconds
+
+    # A second of driving is measured anew each time, and the ratio asked for is 50.
+    assert seconds(0.02) > 10 * seconds(1.0)

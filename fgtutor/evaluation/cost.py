@@ -79,7 +79,8 @@ def estimate(
     drive_seconds = (driven - assessed) / at_once
     cells = sum(terrain.elevation.heights.size for terrain in terrains)
     metres = sum(float(np.hypot(*np.subtract(t.goal, t.start))) for t in terrains)
-    driving = episodes * metres * detour / specialist.command[0] * drive_seconds
+    slowest = min(one.command[0] for one in zoo.values())
+    driving = episodes * metres * detour / slowest * drive_seconds
     return Cost(
         work=f"{grounds * len(zoo) * len(terrains):,} maps to assess and up to "
         f"{episodes * len(terrains):,} episodes, at most",
