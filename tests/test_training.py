@@ -218,6 +218,20 @@ def test_a_run_starts_from_a_trained_policy_with_a_critic_of_its_own(trained, tm
     assert row["samples"] == specialist.provenance["samples"] + 3 * 4 * 8
 
 
+def test_a_trained_policy_learns_on_gently(trained, tmp_path):
+    """In its first update it changes no more than in later ones: what it can do is not lost."""
+    start = trained[0].folder / "specialist"
+    settings = TINY | {"num_envs": 64, "critic_warmup": 1, "warm_std": 0.06}
+    trainer = Trainer(TrainConfig(out=tmp_path / "run", start_from=start, **settings))
+    policy = trainer.algorithm.get_policy()
+    trainer.iterate()
+    seen = trainer.env.get_observations()
+    before, std = policy(seen).detach(), policy.distribution.log_std_param.exp().detach()
+    trainer.iterate()
+    kl = ((policy(seen).detach() - before) / std).square().sum(-1).mean() / 2
+    assert kl < 0.05
+
+
 def test_from_a_run_its_critic_and_net_come_along_and_nothing_warms_up(trained, tmp_path):
     config, specialist, _ = trained
     killed = shutil.copytree(config.folder, tmp_path / "killed")

@@ -35,6 +35,9 @@ OUTGROWN = 0.45
 """Share of the way to the last row at which, on the mean, robots have outgrown the first one."""
 LIFT = 0.25
 """Share of what is missing to full difficulty by which the first row is then lifted."""
+GENTLY = 0.02
+"""Share of the learning rate at which a trained policy begins to learn on, with an optimiser that
+knows nothing of it yet; the rate then adapts within an iteration or two."""
 KEPT = ("iteration", "samples_before", "critic_warmup", "easiest", "seconds", "history")
 """What a checkpoint keeps of the trainer's own fields."""
 
@@ -146,7 +149,8 @@ class Trainer:
         """
         if self.config.start_from and self.iteration in (0, self.critic_warmup):
             self._free_policy()
-            self.algorithm.learning_rate = self.config.learning_rate
+            share = 1.0 if self.iteration < self.critic_warmup else GENTLY
+            self.algorithm.learning_rate = share * self.config.learning_rate
         began, done = time.monotonic(), self.iteration / self.config.iterations
         self.algorithm.entropy_coef = self.config.entropy * max(0.0, 1 - 1.25 * done)
         for group in self.algorithm.feasibility_optimizer.param_groups:
