@@ -139,17 +139,17 @@ DISTURBED = A1EnvConfig(
 )
 """What evaluation calls disturbed."""
 WIDE = A1EnvConfig(
-    calm_share=0.2,
-    friction=(0.25, 1.0),
+    calm_share=0.3,
+    friction=(0.3, 1.25),
     payload=(-1.0, 3.0),
     centre_shift=0.04,
     gain_share=0.1,
     delayed_share=0.0,
     strength=(0.8, 1.2),
     rate_gain=(0.5, 2.0),
-    joint_damping=(0.0, 2.5),
+    joint_damping=(0.0, 2.0),
     dry_friction=(0.0, 0.3),
-    delay=(0.0, 0.05),
+    delay=(0.0, 0.04),
     push_speed=0.7,
     push_seconds=6.0,
     velocity="none",
