@@ -213,20 +213,6 @@ def test_crossings_begin_anywhere_up_to_their_run_up(robot):
 
 
 @robots
-def test_who_begins_nearer_to_an_obstacle_begins_nearer_to_its_lane(robot):
-    """It comes to the lane at 45 degrees at most, and shall be on it where the obstacle begins."""
-    terrain = make_terrain("bridge", robot=robot, seed=3)
-    config = EnvConfig(run_up=0.2, start_beside=0.5, traverse_share=1.0)
-    env = env_class(robot)(World([[terrain]]), 512, config=config)
-    x = env.motion()[0][:, 0] - env.crossings.corner(torch.arange(512))[:, 0]
-    forwards = torch.cos(env.crossings.target_yaw) > 0
-    room = torch.where(forwards, terrain.span[0] - x, x - terrain.span[1])
-    beside = (env.crossings.beside_lane(env.motion()[0]) + env.crossings.aside).abs()
-    assert (beside <= terrain.spread + room.clamp(max=0.5) + 1e-4).all()
-    assert beside[room < 0.3].max() > 0.15 and beside[room > 0.5].max() > 0.4
-
-
-@robots
 def test_going_on_to_a_neighbours_obstacle_is_infeasible_but_no_fault(robot):
     """What would happen there is unknown, so it must not look feasible; PPO sees a time-out."""
     terrain = make_terrain("gaps", robot=robot, seed=3, neighbours=True)

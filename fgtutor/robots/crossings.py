@@ -133,19 +133,17 @@ class Crossings:
         ]
         ends = np.array([[(way[0, 0], way[-1, 0]) for way in row] for row in ways])
         # Where a crossing begins at the latest, if that is beyond the tile's end.
-        spans = np.array([[tile.span for tile in row] for row in tiles])
-        near = np.where(yaws[..., None], ends, spans + config.run_up * np.array([-1.0, 1.0]))
+        near = np.where(yaws[..., None], ends, [[tile.span for tile in row] for row in tiles])
+        near = near + config.run_up * np.array([-1.0, 1.0])
         near = np.clip(near, ends.min(-1, keepdims=True), ends.max(-1, keepdims=True))
-        # An obstacle that lies at an angle spans another part of the way: it is taken to be far.
-        spans = np.where(yaws[..., None], math.inf, spans)
         lanes = [
             [np.interp(x, *way[way[:, 0].argsort(kind="stable")].T) for way in row] for row in ways
         ]
         spreads = [[tile.spread for tile in row] for row in tiles]
         limits = [[tile.limits or (0.0, size[0]) for tile in row] for row in tiles]
-        self.offsets, self.lanes, self.spreads, self.limits, self.ends, self.near, self.spans = (
+        self.offsets, self.lanes, self.spreads, self.limits, self.ends, self.near = (
             torch.as_tensor(np.array(table), dtype=torch.float32, device=device)
-            for table in (world.offset, lanes, spreads, limits, ends, near, spans)
+            for table in (world.offset, lanes, spreads, limits, ends, near)
         )
         self.num_rows, self.num_columns = self.offsets.shape[:2]
         self.everyone = torch.arange(num_envs, device=device)
@@ -196,9 +194,8 @@ class Crossings:
         x = self.ends[row, column, side]
         if math.isfinite(self.config.run_up):
             x = x + self._uniform(n) * (self.near[row, column, side] - x)
-        # Near enough to the lane to reach it before the obstacle begins, at 45 degrees.
-        reach = (self.spans[row, column, side] - x).abs().clamp(max=self.config.start_beside)
-        beside = (self.spreads[row, column] + reach).clamp(max=0.3 * width)
+        # Near enough to the lane to reach it before the obstacle begins.
+        beside = (self.spreads[row, column] + self.config.start_beside).clamp(max=0.3 * width)
         beside = beside * (2 * self._uniform(n) - 1)
         y = self._lane(ids, corner[:, 0] + x) + beside
         ahead = self.yaw(ids)
