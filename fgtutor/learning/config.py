@@ -128,7 +128,8 @@ class TrainConfig:
     gamma: Share = 0.98
     """Discount per control step; at 25 Hz, 0.98 looks two seconds ahead."""
     learning_rate: Rate = 1e-3
-    """Initial PPO learning rate; adapted to the KL divergence."""
+    """Initial PPO learning rate; adapted to the KL divergence. A trained policy begins at
+    a fiftieth of it."""
     entropy: Share = 0.003
     """PPO entropy coefficient at the start; it falls to zero over the run."""
     initial_std: Std = 0.6
