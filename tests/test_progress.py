@@ -24,19 +24,6 @@ def test_work_that_lasts_shows_a_bar_and_the_expected_time(monkeypatch, capsys):
     assert not capsys.readouterr().err
 
 
-def test_a_slow_first_part_alone_decides_no_estimate(monkeypatch, capsys):
-    now = [0.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-
-    def parts():
-        for i in range(1000):
-            yield i
-            now[0] += 1.0 if i else 100.0
-
-    list(watch(parts(), 1000, "fitting", show=True))
-    assert "fitting: about 1.6 h\n" in capsys.readouterr().err  # 28 h by the first part
-
-
 def test_a_line_is_said_while_one_waits_and_not_after(monkeypatch, capsys):
     monkeypatch.setattr(progress, "QUICK", 0.0)
     with waiting("boiling") as timer:

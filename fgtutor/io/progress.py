@@ -18,9 +18,7 @@ T = TypeVar("T")
 QUICK = 2.0
 """What is over within so many seconds shows no bar."""
 TRIED = 0.5
-"""Seconds of work after which the whole is estimated, if also a share `SAMPLE` of it is done."""
-SAMPLE = 0.02
-"""Share of the parts that must be done by then: the first ones may take longer than the others."""
+"""Seconds of work after which the whole is estimated."""
 LONG = 10.0
 """What takes more seconds than this is announced."""
 
@@ -35,7 +33,7 @@ def watch(
             yield part
             bar.update()
             spent = time.monotonic() - began
-            if not told and spent > TRIED and done >= SAMPLE * total:
+            if not told and spent > TRIED:
                 told, expected = True, spent * total / done
                 if expected > LONG:
                     tqdm.write(f"{what}: about {duration(expected)}", file=sys.stderr)
