@@ -23,7 +23,6 @@ from fgtutor.io.validation import Count, Unbounded, check_fields
 from fgtutor.robots import env_class
 from fgtutor.robots.base import LocomotionEnv
 from fgtutor.robots.conditions import Condition
-from fgtutor.robots.crossings import LOOKAHEAD
 from fgtutor.routes import Refusal, Route
 from fgtutor.settings import PlanSettings
 from fgtutor.specialist import Specialist
@@ -41,8 +40,9 @@ Factor = Annotated[float, Interval(ge=0, le=1e6)]
 class FollowConfig:
     """How a route is followed, and when an episode is over."""
 
-    lookahead: Magnitude = LOOKAHEAD
-    """Distance to the point on the route that the robot steers for, m."""
+    lookahead: Magnitude = 0.6
+    """Distance to the point on the route that the robot steers for, m. Robots turn in about that
+    (speed / greatest turn rate); with less, the A1 missed right-angled bends before a wall."""
     goal_radius: Magnitude = 0.35
     """The goal is reached within this distance of it, m."""
     patience: Factor = 3.0
@@ -52,6 +52,9 @@ class FollowConfig:
     """Seconds added to the time limit."""
     stuck_seconds: Unbounded = 10.0
     """A robot that has come no further on its route for this long has run out of time too, s."""
+    acceleration: Factor = 0.5
+    """Greatest change of the speed told along a route, m/s^2: the robot has slowed down by the time
+    that a slower policy takes over."""
     hold_steps: Count = PlanSettings.hold_steps
     """Hysteresis: a policy takes over once it has been wanted for this many control steps."""
     start_noise: Magnitude = 0.03
@@ -218,8 +221,9 @@ class _Drive:
         self.tracks = tracks
         self.corners = env.offsets[0, tiles].cpu().numpy().astype(np.float64)
         self.rngs = [np.random.default_rng(seed) for seed in seeds]
-        self.speeds = np.array([specialist.command[0] for specialist in specialists])
-        seconds = np.array([track.seconds(self.speeds) for track in tracks])
+        speeds = np.array([specialist.command[0] for specialist in specialists])
+        self.told = [track.told(speeds, config.acceleration) for track in tracks]
+        seconds = np.array([track.seconds(speeds) for track in tracks])
         self.limits = (config.patience * seconds + config.grace) / env.control_dt
         n = len(tracks)
         self.error, self.believed_error = np.zeros((2, n, 2))
@@ -292,7 +296,7 @@ class _Drive:
     def _command(self, pose: Float[np.ndarray, "trials 4"]) -> None:
         """Command (v, 0, w) by pure pursuit from where each robot believes it is.
 
-        v is the planning command of its active policy, and less while it turns.
+        v is what it is told where it is (`_Track.told`), and less while it turns.
         """
         config, n = self.config, len(self.tracks)
         if config.drift or config.position_noise:
@@ -307,12 +311,13 @@ class _Drive:
             believed = pose[:, :2]
         if config.displaced_scan:
             self.env.displacement[:] = torch.as_tensor(believed - pose[:, :2])
-        aims = np.zeros(n)
+        aims, speeds = np.zeros((2, n))
         for i, track in enumerate(self.tracks):
             track.advance(believed[i])
             aims[i] = track.bearing(believed[i], config.lookahead, pose[i, 3])
+            speeds[i] = self.told[i][track.nearest]
             self._choose(i, track.policy)
-        numbers = np.stack((aims, pose[:, 3], self.speeds[self.active]))
+        numbers = np.stack((aims, pose[:, 3], speeds))
         wanted, yaw, self.env.cruise[:] = torch.as_tensor(numbers).to(self.env.command)
         self.env.steer(wanted, yaw)
 
@@ -348,9 +353,9 @@ class _Track:
         self.length = float(at[-1])
         if self.length > LONGEST:
             raise ConfigError(f"a route of {self.length:g} m is too long, at most {LONGEST:g} m")
-        distance = np.append(np.arange(0.0, self.length, self.SPACING), self.length)
-        edge = np.clip(np.searchsorted(at, distance, "right") - 1, 0, max(len(at) - 2, 0))
-        self.points = np.stack([np.interp(distance, at, xy[:, axis]) for axis in (0, 1)], axis=-1)
+        self.distance = np.append(np.arange(0.0, self.length, self.SPACING), self.length)
+        edge = np.clip(np.searchsorted(at, self.distance, "right") - 1, 0, max(len(at) - 2, 0))
+        self.points = np.stack([np.interp(self.distance, at, line) for line in xy.T], axis=-1)
         named = route.policies[edge].tolist() if len(at) > 1 else [0]
         self.policies = np.array([places[index] for index in named])
         self.nearest = 0
@@ -365,6 +370,19 @@ class _Track:
         """Return the time that it takes at the speeds of its policies, m/s, by their place."""
         steps = np.hypot(*np.diff(self.points, axis=0).T)
         return float((steps / speeds[self.policies[:-1]]).sum())
+
+    def told(
+        self, speeds: Float[np.ndarray, "policies"], acceleration: float
+    ) -> Float[np.ndarray, "points"]:
+        """Return the speed at each point, m/s: its policy's, changing by `acceleration` at most.
+
+        v^2 changes by at most 2 a per metre, so a robot brakes before a slower policy takes over.
+        """
+        square = speeds[self.policies] ** 2
+        change = 2 * acceleration * self.distance
+        braking = np.minimum.accumulate((square + change)[::-1])[::-1] - change
+        gathering = np.minimum.accumulate(square - change) + change
+        return np.sqrt(np.minimum(braking, gathering))
 
     def bearing(self, place: np.ndarray, distance: float, there: float = 0.0) -> float:
         """Return the direction to the point `distance` metres further along, or to the end, rad.

@@ -59,9 +59,32 @@ def test_each_policy_drives_at_its_own_speed(make_rolling):
     assert episode.success and episode.switches == 1
     x, by = episode.poses[:, 0], episode.policies
     moved = np.append(0.0, np.diff(x)) * len(x) / episode.seconds
-    slow, fast = (np.median(moved[by == policy]) for policy in (0, 1))
+    # From 0.4 to 1.2 m/s at 0.5 m/s^2 it takes 1.28 m.
+    slow, fast = np.median(moved[by == 0]), np.median(moved[x > both.xy[half, 0] + 1.5])
     assert slow == pytest.approx(0.4, abs=0.05) and fast == pytest.approx(1.2, abs=0.1)
     assert x[by == 0].max() == pytest.approx(both.xy[half, 0], abs=0.2)
+
+
+@pytest.mark.parametrize(("acceleration", "entering"), [(0.5, 0.5), (1e6, 1.2)])
+def test_it_has_slowed_down_when_a_slower_policy_takes_over(make_rolling, acceleration, entering):
+    route, terrain = task((0.5, 2.0), (5.5, 2.0))
+    half = len(route.policies) // 2
+    policies = np.where(np.arange(len(route.policies)) < half, 0, 1)
+    both = replace(route, policies=policies, names=("fast", "slow"))
+    zoo = {
+        name: make_rolling(name, command=(speed, 0.0, 0.0))
+        for name, speed in (("fast", 1.2), ("slow", 0.5))
+    }
+    config = FollowConfig(acceleration=acceleration)
+    episode = execute(both, terrain, zoo, config=config)
+    assert episode.success
+    x = episode.poses[:, 0]
+    v = np.diff(x) * len(x) / episode.seconds
+    seam = int(np.argmax(x > both.xy[half, 0] - 0.05))
+    assert v[seam] == pytest.approx(entering, abs=0.12)
+    # (1.2^2 - 0.5^2) / (2 * 0.5) = 1.19 m before it, nothing has changed yet.
+    before = (x[:-1] > 1.2) & (x[:-1] < both.xy[half, 0] - 1.3)
+    assert np.median(v[before]) == pytest.approx(1.2, abs=0.1)
 
 
 def test_the_time_limit_is_that_of_the_speeds_on_the_route(make_rolling):
@@ -108,7 +131,8 @@ def test_it_starts_towards_where_it_will_steer_not_along_the_first_cell(make_rol
     terrain, sure = Terrain.from_elevation(elevation, *ends), FollowConfig(start_yaw_noise=0)
     episode = execute(route, terrain, {"roll": make_rolling()}, config=sure)
     assert episode.success
-    assert episode.poses[0, 3] == pytest.approx(math.atan2(0.2, 0.37), abs=0.1)
+    # 0.6 m along it: two diagonals, 0.2 m each way, and 0.32 m straight on.
+    assert episode.poses[0, 3] == pytest.approx(math.atan2(0.2, 0.52), abs=0.1)
 
 
 @pytest.mark.slow

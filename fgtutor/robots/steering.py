@@ -1,4 +1,4 @@
-"""How a robot is steered: to a line that it shall follow, in training as on a route.
+"""How a robot is steered: to a line in training, to a heading on a route.
 
 Reads headings and distances, one per robot; gives headings, speeds and turn rates. A line is
 followed by pure pursuit (Coulter, 1992).
@@ -11,14 +11,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 LOOKAHEAD = 0.45
-"""Distance to the point on its line that a robot steers for, m, in training as on a route."""
+"""Distance to the point on its line that a robot steers for while it learns, m."""
 
 
 def bearing(beside: Float[Tensor, "envs"]) -> Float[Tensor, "envs"]:
     """Return by how much to head to the right of a line's direction to come back to it, rad.
 
     `beside` is how far to the left of the line each robot is, m. It steers for the point of the
-    line that is `LOOKAHEAD` away, and never comes in at more than 45 degrees, as on a route.
+    line that is `LOOKAHEAD` away, and never comes in at more than 45 degrees.
     """
     steepest = math.sin(math.pi / 4)
     return torch.asin((beside / LOOKAHEAD).clamp(-steepest, steepest))
