@@ -323,14 +323,6 @@ def test_stance_share_is_a_trot():
     assert share[2].tolist() == pytest.approx([0, 1, 1, 0], abs=1e-6)
 
 
-def test_a_walking_trot_keeps_diagonal_feet_together_and_lifts_them_for_less():
-    share = rewards.stance_share(torch.arange(200) / 200, "walking-trot")
-    assert torch.allclose(share, share[:, [3, 2, 1, 0]])
-    assert (share > 0.5).float().mean(dim=0).tolist() == pytest.approx([0.7] * 4, abs=0.02)
-    assert ((share > 0.9).sum(dim=-1) == 4).float().mean() > 0.15
-    assert torch.allclose(share.roll(100, 0), share[:, [1, 0, 3, 2]], atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("stance", "force", "slide", "clearance", "expected"),
     [

@@ -503,11 +503,6 @@ def test_an_estimating_run_starts_from_a_shipped_policy_and_resumes_exactly(tmp_
     assert conditions["friction"] == WIDE.friction and conditions["delay"] == WIDE.delay
 
 
-def test_a_robot_without_legs_knows_no_gait(tmp_path):
-    with pytest.raises(ConfigError, match="toy has no gaits: leave walking-trot out"):
-        Trainer(tiny(tmp_path, gait="walking-trot"))
-
-
 @pytest.mark.slow
 def test_a_warm_start_keeps_the_policy_while_critic_and_encoder_learn(tmp_path):
     train(tiny(tmp_path / "walk", iterations=1))

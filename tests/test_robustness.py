@@ -88,7 +88,7 @@ def test_a_caption_says_every_range():
     for part in ("friction 0.4 to 1.1", "payload 0 to 2 kg", "delay 0 to 0.03 s", "0.5 m/s"):
         assert part in words
     # A disturbance that training can draw has words: whatever is new must be said, too.
-    reward = {"gait", "gait_frequency", "swing_height", "weights"}
+    reward = {"gait_frequency", "swing_height", "weights"}
     silent = {"randomise", "action_scale", "substeps"} | reward
     details = {"push_seconds", "noise_share", "scan_noise"}
     velocity = {"velocity", "velocity_error", "velocity_seconds"}

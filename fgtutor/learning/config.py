@@ -30,7 +30,7 @@ from fgtutor.learning.ppo import FeasibilityPPO
 from fgtutor.policies.dreamwaq import HISTORY, LONGER, DreamWaQModel, EstimatingModel
 from fgtutor.policies.symmetry import SymmetricMLPModel
 from fgtutor.robots import ROBOTS, env_class
-from fgtutor.robots.base import Gait, LocomotionEnv
+from fgtutor.robots.base import LocomotionEnv
 from fgtutor.world.obstacles import OBSTACLES
 from fgtutor.world.terrain import Terrain, World, make_terrain
 from fgtutor.world.turned import make_turned
@@ -82,9 +82,6 @@ class TrainConfig:
     disturbances: Literal["usual", "wide"] = "usual"
     """How far robots, sensors and ground differ from one another; wide, of robots that have it, for
     policies that shall hold under disturbance and on other models."""
-    gait: Gait = "trot"
-    """How the feet of a robot with legs take turns: in diagonal pairs, or the same with each
-    standing for longer, which suits joints that are damped strongly."""
     hours: NonNegative = 0.0
     """Stop and save after this many hours; --resume goes on. 0 sets no limit."""
     iterations: Count = 200
@@ -288,10 +285,6 @@ def make_training_env(config: TrainConfig, iteration: int = 0) -> LocomotionEnv:
             f"{config.robot} knows no {config.disturbances} disturbances: leave them usual"
         )
     settings = make.disturbances[config.disturbances]
-    if config.gait != "trot":
-        if not hasattr(settings, "gait"):
-            raise ConfigError(f"{config.robot} has no gaits: leave {config.gait} out")
-        settings = dataclasses.replace(settings, gait=config.gait)
     return make(
         training_world(config, iteration),
         config.num_envs,

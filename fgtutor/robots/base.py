@@ -8,7 +8,7 @@ episodes lead is the work of `crossings`. A robot adds its physics in a handful 
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -29,8 +29,6 @@ from fgtutor.world.terrain import TerrainSeed, World
 
 Layout = tuple[list[dict[str, Any]], dict[str, Any]]
 """The parts of the observation in order (see `part`), and what an action means."""
-Gait = Literal["trot", "walking-trot"]
-"""How feet take turns: in diagonal pairs, or the same with each standing for longer."""
 
 
 def plain_tensors(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -66,7 +64,7 @@ class LocomotionEnv(VecEnv):
     """Which three of its numbers it has to estimate instead: its velocity."""
     disturbances: ClassVar[Mapping[str, Any]] = {"usual": None}
     """Kinds of disturbance that training may ask for, and the `settings` of each; None: the class's
-    own. Settings with a field `gait` are those of a robot that can be asked for one."""
+    own."""
 
     @plain_tensors
     def __init__(

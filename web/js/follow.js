@@ -6,12 +6,12 @@
  * fgtutor/robots/steering.py: pure pursuit (Coulter, 1992), hysteresis, and slower turns.
  */
 
-const { atan2, cos, hypot, max, min, PI } = Math;
+const { atan2, cos, hypot, max, min, sqrt, PI } = Math;
 
 /** How a route is followed, and when an episode is over; as `FollowConfig`. */
 export const FOLLOW = {
   /** Distance to the point on the route that the robot steers for, m. */
-  lookahead: 0.45,
+  lookahead: 0.6,
   /** The goal is reached within this distance of it, m. */
   goalRadius: 0.35,
   /** Time limit as a multiple of the route's time at its policies' speeds, plus `grace`. */
@@ -20,6 +20,8 @@ export const FOLLOW = {
   grace: 5,
   /** A robot that has come no further for this long has run out of time too, s. */
   stuckSeconds: 10,
+  /** Greatest change of the speed told along a route, m/s^2. */
+  acceleration: 0.5,
   /** A policy takes over once it has been wanted for this many control steps. */
   holdSteps: 3,
 };
@@ -43,6 +45,8 @@ export class Track {
     this.points = [];
     /** @type {number[]} */
     this.policies = [];
+    /** How far along the route each point is, m. */
+    this.distance = [];
     const inside = Math.ceil(this.length / SPACING);
     for (let i = 0, edge = 0; i <= inside; i++) {
       const distance = i < inside ? i * SPACING : this.length;
@@ -52,6 +56,7 @@ export class Track {
       const [[x0, y0], [x1, y1]] = [xy[edge], xy[next]];
       this.points.push([x0 + share * (x1 - x0), y0 + share * (y1 - y0)]);
       this.policies.push(policies[edge] ?? 0);
+      this.distance.push(distance);
     }
     this.nearest = 0;
     /** Steps since it last came further. */
@@ -76,6 +81,19 @@ export class Track {
       total += hypot(x1 - x0, y1 - y0) / speeds[this.policies[i - 1]];
     }
     return total;
+  }
+
+  /**
+   * Return the speed told at each point, m/s: its policy's, but v^2 changes by at most
+   * 2 * `acceleration` per metre, before a slower policy as after one.
+   */
+  told(speeds, acceleration) {
+    const square = this.policies.map((policy) => speeds[policy] ** 2);
+    const last = square.length - 1;
+    const between = (i) => 2 * acceleration * (this.distance[i + 1] - this.distance[i]);
+    for (let i = last - 1; i >= 0; i--) square[i] = min(square[i], square[i + 1] + between(i));
+    for (let i = 0; i < last; i++) square[i + 1] = min(square[i + 1], square[i] + between(i));
+    return square.map(sqrt);
   }
 
   /**
@@ -120,6 +138,7 @@ export class Follower {
     this.active = track.policy;
     this.waiting = 0;
     this.steps = 0;
+    this.told = track.told(robot.speeds, config.acceleration);
     this.limit = config.patience * track.seconds(robot.speeds) + config.grace;
   }
 
@@ -134,7 +153,7 @@ export class Follower {
     track.advance(place);
     const wanted = track.bearing(place, config.lookahead, yaw);
     this.choose(track.policy);
-    const vx = robot.speeds[this.active] * slowdown(wanted, yaw, robot.slowest);
+    const vx = this.told[track.nearest] * slowdown(wanted, yaw, robot.slowest);
     return [vx, 0, turnRate(wanted, yaw, robot.maxTurnRate)];
   }
 

@@ -346,7 +346,7 @@ class A1Env(LocomotionEnv):
         force = self._feet("foot_force").norm(dim=-1)
         foot = self._feet("foot_position")
         gait = rewards.gait(
-            rewards.stance_share(self.clock, self.settings.gait),
+            rewards.stance_share(self.clock),
             force,
             self._feet("foot_velocity").norm(dim=-1),
             foot[..., 2] - FOOT_RADIUS - self._lookup(self.edges, foot[..., :2]),

@@ -23,7 +23,6 @@ from fgtutor.robots.a1.model import LEGS, A1Config
 from fgtutor.robots.a1.observation import SCAN_NOISE
 from fgtutor.robots.a1.physics import Physics
 from fgtutor.robots.a1.rewards import RewardWeights
-from fgtutor.robots.base import Gait
 
 Friction = Annotated[float, Interval(gt=0, le=5)]
 """A coefficient of friction."""
@@ -53,8 +52,6 @@ class A1EnvConfig:
     """Simulation steps per control step: 50 Hz control."""
     gait_frequency: Annotated[float, Interval(gt=0, le=20)] = 2.0
     """Gait cycles per second."""
-    gait: Gait = "trot"
-    """How feet shall take turns, by the reward."""
     swing_height: Annotated[tuple[Share, Share], Ascending] = (0.04, 0.1)
     """Lowest and highest clearance of a good swing, m."""
     weights: RewardWeights = field(default_factory=RewardWeights)

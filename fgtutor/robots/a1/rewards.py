@@ -17,15 +17,9 @@ from torch import Tensor
 
 from fgtutor.io.validation import check_fields
 from fgtutor.robots.a1.model import JOINT_RANGES, LINKS
-from fgtutor.robots.base import Gait
 
-GAITS: dict[Gait, tuple[tuple[float, ...], float]] = {
-    "trot": ((0.0, 0.5, 0.5, 0.0), 0.0),
-    "walking-trot": ((0.0, 0.5, 0.5, 0.0), 0.6),
-}
-"""By how much of a gait cycle each leg is ahead, and what keeps feet on the ground for longer than
-half of it: a trot moves diagonal legs together; so does a walking trot, whose feet stand for 0.7 of
-the cycle."""
+TROT = (0.0, 0.5, 0.5, 0.0)
+"""By how much of a gait cycle each leg is ahead: diagonal legs move together."""
 POSTURE = (3.0, 0.1, 0.1) * 4
 """How much each joint's distance from `NARROW` counts: legs may bend, but not spread."""
 NARROW = (0.2, 0.0, 0.0, -0.2, 0.0, 0.0) * 2
@@ -83,14 +77,13 @@ def moving(speed_error: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     return 0.2 + 0.8 * kernel(speed_error, 0.25)
 
 
-def stance_share(clock: Float[Tensor, "n"], gait: Gait = "trot") -> Float[Tensor, "n 4"]:
+def stance_share(clock: Float[Tensor, "n"]) -> Float[Tensor, "n 4"]:
     """Return how much each foot should stand (1) or swing (0) at a clock in gait cycles.
 
     The two blend into each other, so that the moment of touching down is the robot's to choose.
     """
-    ahead, longer = GAITS[gait]
-    phase = clock[:, None] + torch.tensor(ahead, device=clock.device)
-    return (0.5 + 1.2 * (torch.sin(2 * math.pi * phase) + longer)).clamp(0.0, 1.0)
+    phase = clock[:, None] + torch.tensor(TROT, device=clock.device)
+    return (0.5 + 1.2 * torch.sin(2 * math.pi * phase)).clamp(0.0, 1.0)
 
 
 def gait(
