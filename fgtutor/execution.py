@@ -40,7 +40,7 @@ Factor = Annotated[float, Interval(ge=0, le=1e6)]
 class FollowConfig:
     """How a route is followed, and when an episode is over."""
 
-    lookahead: Magnitude = 0.6
+    lookahead: Magnitude = 0.55
     """Distance to the point on the route that the robot steers for, m. Robots turn in about that
     (speed / greatest turn rate); with less, the A1 missed right-angled bends before a wall."""
     goal_radius: Magnitude = 0.35

@@ -49,7 +49,7 @@ draw_route(route, M)
 # ## How to follow a line: pure pursuit
 #
 # The route is a line. To follow it, the robot looks for the point of the line nearest to it, goes
-# on from there by the **lookahead** $\ell$ (0.6 m), and steers for the point it finds there. Let
+# on from there by the **lookahead** $\ell$ (0.55 m), and steers for the point it finds there. Let
 # $\psi^*$ be the direction from the robot to that point and $\psi$ the robot's yaw. It turns at
 #
 # $$
@@ -64,7 +64,7 @@ from itertools import pairwise
 
 import numpy as np
 
-lookahead = 0.6
+lookahead = 0.55
 line = np.array([(0, 0), (0.5, 0), (1, 0.5), (1.5, 0.5)])
 robot, yaw = np.array((0.3, 0.15)), -0.3
 
@@ -95,7 +95,7 @@ sketch = Picture(7.0, 3.2)
 axes = sketch.subplots()
 axes.plot(*line.T, color="silver", linewidth=6, label="route")
 axes.plot(*fine[nearest], "o", color="black", label="nearest point")
-axes.plot(*aim, "*", color="black", markersize=14, label="aim: 0.6 m further on")
+axes.plot(*aim, "*", color="black", markersize=14, label="aim: 0.55 m further on")
 axes.annotate("", robot + 0.3 * np.array((np.cos(yaw), np.sin(yaw))), robot,
               arrowprops={"arrowstyle": "->", "linewidth": 2})  # fmt: skip
 axes.plot(*np.stack((robot, aim)).T, "--", color="black", label="where it wants to go")

@@ -11,7 +11,7 @@ const { atan2, cos, hypot, max, min, sqrt, PI } = Math;
 /** How a route is followed, and when an episode is over; as `FollowConfig`. */
 export const FOLLOW = {
   /** Distance to the point on the route that the robot steers for, m. */
-  lookahead: 0.6,
+  lookahead: 0.55,
   /** The goal is reached within this distance of it, m. */
   goalRadius: 0.35,
   /** Time limit as a multiple of the route's time at its policies' speeds, plus `grace`. */
