@@ -258,10 +258,13 @@ reveal("below 0.05")
 # ## The wrong driver
 #
 # How much of this do we owe to choosing the right policy? Take the very same route, and let one
-# specialist drive all of it.
+# specialist drive all of it, from five starts a few centimetres apart.
 
 # %%
-predict("How many of the four specialists reach the goal alone?", ["none", "one", "two or more"])
+predict(
+    "How many of the four specialists reach the goal alone more often than not?",
+    ["none", "one", "two or more"],
+)
 
 # %%
 from dataclasses import replace
@@ -272,25 +275,28 @@ alone = {
     name: replace(route, policies=np.full_like(route.policies, i))
     for i, name in enumerate(planned.names)
 }
-count = len(alone)
-attempts = execute_batch(
-    list(alone.values()), [terrain] * count, zoo, seeds=[0] * count,
-    config=FollowConfig(patience=1.5), record_body=True,
-)  # fmt: skip
-for name, attempt in zip(alone, attempts, strict=True):
-    print(f"{name:7} {attempt}")
+starts = range(5)
+attempts = {
+    name: execute_batch(
+        [way] * len(starts), [terrain] * len(starts), zoo, seeds=starts,
+        config=FollowConfig(patience=1.5), record_body=True,
+    )
+    for name, way in alone.items()
+}  # fmt: skip
+for name, drives in attempts.items():
+    print(f"{name:7} arrives {sum(d.success for d in drives)} of 5 times; the first: {drives[0]}")
 
 # %%
-worst = min(range(count), key=lambda i: attempts[i].length)
-assert not any(attempt.success for attempt in attempts)
+worst = min(attempts, key=lambda name: attempts[name][0].length)
+assert all(sum(d.success for d in drives) <= 2 for drives in attempts.values())
 reveal("none")
-draw_drive(attempts[worst], alone[planned.names[worst]], M)
+draw_drive(attempts[worst][0], alone[worst], M)
 
 # %%
-film_strip(attempts[worst], terrain, alone[planned.names[worst]], count=4)
+film_strip(attempts[worst][0], terrain, alone[worst], count=4)
 
 # %% [markdown]
-# *What to see:* the route is the same; only the driver is different, and it does not arrive.
+# *What to see:* the route is the same; only the driver is different, and it hardly ever arrives.
 
 # %% [markdown]
 # ## One drive proves little
