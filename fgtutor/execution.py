@@ -382,7 +382,7 @@ class _Track:
         change = 2 * acceleration * self.distance
         braking = np.minimum.accumulate((square + change)[::-1])[::-1] - change
         gathering = np.minimum.accumulate(square - change) + change
-        return np.sqrt(np.minimum(braking, gathering))
+        return np.sqrt(np.minimum(braking, gathering).clip(min=square.min()))
 
     def bearing(self, place: np.ndarray, distance: float, there: float = 0.0) -> float:
         """Return the direction to the point `distance` metres further along, or to the end, rad.

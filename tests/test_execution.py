@@ -9,7 +9,7 @@ from fgtutor import execution
 from fgtutor.directions import STEPS
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, InfeasibleCellError
-from fgtutor.execution import FollowConfig, execute, execute_batch
+from fgtutor.execution import FollowConfig, _Track, execute, execute_batch
 from fgtutor.planning import plan
 from fgtutor.robots import conditions_of
 from fgtutor.robots.toy import ToyEnv
@@ -46,60 +46,58 @@ def test_a_toy_reaches_the_end_of_a_straight_route(make_rolling):
     assert episode.body is not None and len(episode.body) == len(episode.poses)
 
 
-def test_each_policy_drives_at_its_own_speed(make_rolling):
+def two_speeds(make_rolling, first, second):
+    """Return 5 m straight on whose halves two policies drive, where they meet, terrain and zoo."""
     route, terrain = task((0.5, 2.0), (5.5, 2.0))
     half = len(route.policies) // 2
     policies = np.where(np.arange(len(route.policies)) < half, 0, 1)
-    both = replace(route, policies=policies, names=("slow", "fast"))
+    both = replace(route, policies=policies, names=("first", "second"))
     zoo = {
         name: make_rolling(name, command=(speed, 0.0, 0.0))
-        for name, speed in (("slow", 0.4), ("fast", 1.2))
+        for name, speed in (("first", first), ("second", second))
     }
-    episode = execute(both, terrain, zoo)
+    return both, both.xy[half, 0], terrain, zoo
+
+
+def test_each_policy_drives_at_its_own_speed(make_rolling):
+    route, seam, terrain, zoo = two_speeds(make_rolling, 0.4, 1.2)
+    episode = execute(route, terrain, zoo)
     assert episode.success and episode.switches == 1
     x, by = episode.poses[:, 0], episode.policies
     moved = np.append(0.0, np.diff(x)) * len(x) / episode.seconds
     # From 0.4 to 1.2 m/s at 0.5 m/s^2 it takes 1.28 m.
-    slow, fast = np.median(moved[by == 0]), np.median(moved[x > both.xy[half, 0] + 1.5])
+    slow, fast = np.median(moved[by == 0]), np.median(moved[x > seam + 1.5])
     assert slow == pytest.approx(0.4, abs=0.05) and fast == pytest.approx(1.2, abs=0.1)
-    assert x[by == 0].max() == pytest.approx(both.xy[half, 0], abs=0.2)
+    assert x[by == 0].max() == pytest.approx(seam, abs=0.2)
 
 
 @pytest.mark.parametrize(("acceleration", "entering"), [(0.5, 0.5), (1e6, 1.2)])
 def test_it_has_slowed_down_when_a_slower_policy_takes_over(make_rolling, acceleration, entering):
-    route, terrain = task((0.5, 2.0), (5.5, 2.0))
-    half = len(route.policies) // 2
-    policies = np.where(np.arange(len(route.policies)) < half, 0, 1)
-    both = replace(route, policies=policies, names=("fast", "slow"))
-    zoo = {
-        name: make_rolling(name, command=(speed, 0.0, 0.0))
-        for name, speed in (("fast", 1.2), ("slow", 0.5))
-    }
-    config = FollowConfig(acceleration=acceleration)
-    episode = execute(both, terrain, zoo, config=config)
+    route, seam, terrain, zoo = two_speeds(make_rolling, 1.2, 0.5)
+    episode = execute(route, terrain, zoo, config=FollowConfig(acceleration=acceleration))
     assert episode.success
     x = episode.poses[:, 0]
     v = np.diff(x) * len(x) / episode.seconds
-    seam = int(np.argmax(x > both.xy[half, 0] - 0.05))
-    assert v[seam] == pytest.approx(entering, abs=0.12)
+    assert v[np.argmax(x > seam - 0.05)] == pytest.approx(entering, abs=0.12)
     # (1.2^2 - 0.5^2) / (2 * 0.5) = 1.19 m before it, nothing has changed yet.
-    before = (x[:-1] > 1.2) & (x[:-1] < both.xy[half, 0] - 1.3)
+    before = (x[:-1] > 1.2) & (x[:-1] < seam - 1.3)
     assert np.median(v[before]) == pytest.approx(1.2, abs=0.1)
 
 
+def test_no_rounding_makes_a_speed_less_than_the_slowest(make_rolling):
+    route, _, _, _ = two_speeds(make_rolling, 1.0, 1.0)
+    far = replace(route, xy=route.xy * 10_000)
+    track = _Track(far, {0: 0, 1: 1})
+    assert len(track.points) > 1e6
+    told = track.told(np.array([0.001, 0.002]), 1e6)
+    assert told.min() == pytest.approx(0.001) and told.max() < 0.01
+
+
 def test_the_time_limit_is_that_of_the_speeds_on_the_route(make_rolling):
-    route, terrain = task((0.5, 2.0), (5.5, 2.0))
-    half = len(route.policies) // 2
-    both = replace(
-        route, policies=np.arange(len(route.policies)) // half % 2, names=("slow", "fast")
-    )
-    zoo = {
-        name: make_rolling(name, command=(speed, 0.0, 0.0))
-        for name, speed in (("slow", 0.5), ("fast", 1.0))
-    }
+    route, _, terrain, zoo = two_speeds(make_rolling, 0.5, 1.0)
     # Too little for any of it, and of the time that the route takes, not of the slowest's.
     late = FollowConfig(patience=0.5, grace=0.0)
-    episode = execute(both, terrain, zoo, config=late)
+    episode = execute(route, terrain, zoo, config=late)
     assert episode.reason == "timeout"
     assert episode.seconds == pytest.approx(0.5 * (2.5 / 0.5 + 2.5 / 1.0), abs=0.15)
 

@@ -262,7 +262,7 @@ reveal("below 0.05")
 
 # %%
 predict(
-    "How many of the four specialists reach the goal alone more often than not?",
+    "How many of the four specialists reach the goal alone every time?",
     ["none", "one", "two or more"],
 )
 
@@ -288,7 +288,7 @@ for name, drives in attempts.items():
 
 # %%
 worst = min(attempts, key=lambda name: attempts[name][0].length)
-assert all(sum(d.success for d in drives) <= 2 for drives in attempts.values())
+assert not any(all(d.success for d in drives) for drives in attempts.values())
 reveal("none")
 draw_drive(attempts[worst][0], alone[worst], M)
 
@@ -296,7 +296,8 @@ draw_drive(attempts[worst][0], alone[worst], M)
 film_strip(attempts[worst][0], terrain, alone[worst], count=4)
 
 # %% [markdown]
-# *What to see:* the route is the same; only the driver is different, and it hardly ever arrives.
+# *What to see:* the route is the same; only the driver is different, and none can be relied on: one
+# gets through now and then, the others stop or fall where the ground is not theirs.
 
 # %% [markdown]
 # ## One drive proves little
