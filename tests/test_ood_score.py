@@ -10,7 +10,9 @@ from fgtutor.errors import ConfigError, ThresholdError
 from fgtutor.feasibility import FeasibilityNet, OodScore, ood_weight
 from fgtutor.learning import refit, training
 from fgtutor.learning.calibrate import (
+    HELD_OUT,
     CalibrateConfig,
+    Rollout,
     calibrated,
     met_in_training,
     own_terrain,
@@ -18,6 +20,8 @@ from fgtutor.learning.calibrate import (
     roll_out,
 )
 from fgtutor.learning.training import TrainConfig, train
+from fgtutor.robots import condition_of
+from fgtutor.settings import PlanSettings
 from fgtutor.specialist import ZOO, load_specialist, save_specialist
 from fgtutor.tensorization import assess, ood_score
 
@@ -112,6 +116,43 @@ def test_calibrating_changes_neither_policy_nor_f(make_rolling, config, tmp_path
     assert known.provenance["calibration"]["patches"] > 10
     loaded = load_specialist(save_specialist(known, tmp_path / "steps"))
     assert loaded.strangeness == known.strangeness
+
+
+def test_f_is_scaled_to_what_the_policy_reaches(make_rolling, config):
+    shy = make_rolling("flat", f=0.2, provenance={"terrain": "flat"})
+    config = replace(config, agree_under=("undisturbed", "disturbed"))
+    known = calibrated(shy, config)
+    assert known.provenance["calibration"]["agree_under"] == ("undisturbed", "disturbed")
+    assert known.strangeness == calibrated(shy, replace(config, agree_under=())).strangeness
+    patch, command = torch.zeros(1, shy.grid.num_points), torch.tensor([shy.command])
+    presets = [condition_of("toy", name).options for name in config.agree_under]
+    tiles = own_terrain(shy, 3, 2 * HELD_OUT + 1)
+    reached = torch.cat([roll_out(shy, tiles, 3, 1.0, options=one).label for one in presets])
+    with torch.no_grad():
+        assert shy.feasibility.feasibility(patch, command).item() == pytest.approx(0.2, abs=1e-3)
+        f = known.feasibility.feasibility(patch, command).item()
+    assert f == pytest.approx(reached.mean().item(), abs=1e-3) and f > 0.5
+
+
+def test_scaling_finds_the_factor_and_keeps_what_is_feasible():
+    net = FeasibilityNet(12, hidden=(8, 8))
+    patch, command = torch.randn(400, 12), torch.randn(400, 3)
+    with torch.no_grad():
+        weight, bias = list(net.head.parameters())[-2:]
+        weight *= 6.0  # some steps below f_min
+        bias -= 1.5
+        said = net.feasibility(patch, command)
+        pivot = torch.tensor(PlanSettings().f_min).logit()
+        label = torch.sigmoid(pivot + 1.3 * (said.logit() - pivot))
+        drive = Rollout(patch, command, label)
+        f = refit.scaled(net, [drive, drive]).feasibility(patch, command)
+        askew = refit.scaled(net, [Rollout(patch, command, 1 - label)])
+        reverse = askew.feasibility(patch, command)
+    assert 0.1 < (said < 0.1).float().mean() < 0.9
+    torch.testing.assert_close(f, label, atol=1e-3, rtol=0)
+    assert torch.equal(f < 0.1, said < 0.1)
+    assert reverse.max() - reverse.min() < 0.01  # the less feasible never before the more feasible
+    torch.testing.assert_close(net.feasibility(patch, command), said)  # the net itself stays
 
 
 def test_a_specialist_is_calibrated_on_ground_as_it_was_trained_on(make_specialist):

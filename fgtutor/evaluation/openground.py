@@ -62,7 +62,7 @@ from fgtutor.routes import Refusal, Route
 from fgtutor.settings import PAPER, PlanSettings
 from fgtutor.specialist import GENERAL, Specialist
 from fgtutor.statistics import Share
-from fgtutor.world.openground import CELL, Group, OpenGround, make_open_ground
+from fgtutor.world.openground import CELL, Group, OpenGround, OpenTask, make_open_ground
 
 COMMAND = "evaluate openground"
 GROUPS: tuple[Group, ...] = ("seen", "unseen")
@@ -254,7 +254,10 @@ def make_tasks(config: OpenGroundConfig) -> list[Task]:
 
 
 def picture(config: OpenGroundConfig, index: int, rows: Sequence[OpenRow]) -> Draw:
-    """Return what draws a map with our routes over it, and where their drives failed."""
+    """Return what draws a map with our routes over it; `rows` are those of our undisturbed drives.
+
+    Tasks that were refused are not planned again: all headings are tried there, for half a minute.
+    """
 
     def draw(path: Path) -> None:
         # It loads matplotlib, which no worker needs.
@@ -265,12 +268,17 @@ def picture(config: OpenGroundConfig, index: int, rows: Sequence[OpenRow]) -> Dr
         mine = replace(config, planners=(OURS,))
         figure = draw_elevation(elevation)
         axes = figure.axes[0]
-        plans, _ = plan_map(mine, ground, zoo)[OURS]
-        for task, planned in zip(ground.tasks, plans, strict=True):
+        taken: list[OpenTask] = []
+        for row in rows:
+            task = ground.tasks[row["task"]]
+            if row["outcome"] == "no_route":
+                axes.plot(*zip(task.start, task.goal, strict=True), "k:x", linewidth=0.8)
+            else:
+                taken.append(task)
+        plans, _ = plan_map(mine, replace(ground, tasks=tuple(taken)), zoo)[OURS]
+        for planned in plans:
             if isinstance(planned.answer, Route):
                 draw_route(planned.answer, elevation, axes=axes, bare=True)
-            else:
-                axes.plot(*zip(task.start, task.goal, strict=True), "k:x", linewidth=0.8)
         reached = Share.reached(row for row in rows if row["feasible"])
         axes.set_title(
             f"Map {index} ({ground.group}): {reached.successes} of {reached.trials} feasible tasks "
@@ -295,11 +303,12 @@ def run(config: OpenGroundConfig) -> int:
         return estimate(zoo, grounds, grounds=count, episodes=episodes * count, detour=1.5)
 
     def find(trials: list[OpenRow]) -> Findings:
-        able = [row for row in trials if row["feasible"] and row["noise"] == row["drift"] == 0]
+        ideal = [row for row in trials if row["noise"] == row["drift"] == 0]
+        able = [row for row in ideal if row["feasible"]]
         groups: dict[str, dict[str, Share]] = {}
         for (group, name), cell in by_cell(able, ("terrain", "policy")).items():
             groups.setdefault(group, {})[name] = Share.reached(cell)
-        mine = [row for row in able if row["policy"] == OURS]
+        mine = [row for row in ideal if row["policy"] == OURS]
         pictures = {
             f"map-{index:05d}.png": picture(config, index, own)
             for (index,), own in by_cell(mine, ("map",)).items()

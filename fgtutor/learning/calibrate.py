@@ -2,7 +2,8 @@
 
 Reads a specialist; gives quantiles of L_recon and of the strangeness on held-out terrain, driven
 with deterministic actions, and, if asked for, a Feasibility-Net fitted anew (`refit`) to what the
-finished policy meets where it was trained. The policy is never changed.
+finished policy meets where it was trained, or an f scaled to what it reaches. The policy is never
+changed.
 Source: paper, Sec. III-A (Eqs. 1-3); the calibration is ours (`feasibility.OodScore`).
 """
 
@@ -10,7 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -29,8 +30,8 @@ from fgtutor.feasibility import (
 )
 from fgtutor.io.validation import Count, CountOrZero, Seed, Share, Width, check_fields
 from fgtutor.learning.config import Speed, training_tile
-from fgtutor.learning.refit import refitted
-from fgtutor.robots import ROBOTS, env_class
+from fgtutor.learning.refit import refitted, scaled
+from fgtutor.robots import ROBOTS, condition_of, env_class
 from fgtutor.specialist import GENERAL, Specialist, load_specialist, save_specialist
 from fgtutor.world.terrain import Terrain, World
 
@@ -71,6 +72,10 @@ class CalibrateConfig:
     planning_speed: Speed | None = None
     """Forward speed at which the policy drives a route from now on, and which planning pairs with
     every patch, m/s, one that it was trained with; default: as it is."""
+    agree_under: tuple[Literal["undisturbed", "disturbed"], ...] = ()
+    """Presets under which f shall agree with r_v, in the mean over them: it is scaled to what the
+    policy reaches on drives over held-out terrain under each; what is feasible stays so. Default:
+    f stays as it is."""
     worlds: Count = 4
     """Training worlds that the patches for the new one come from."""
     envs: Annotated[int, Interval(ge=1, le=10_000)] = 100
@@ -218,8 +223,9 @@ def met_in_training(specialist: Specialist, config: CalibrateConfig) -> Rollout:
 def calibrated(specialist: Specialist, config: CalibrateConfig) -> Specialist:
     """Return the specialist with quantiles measured on held-out terrain of full difficulty.
 
-    With `config.updates`, its Feasibility-Net is fitted anew before. Raises `ConfigError` if it was
-    never trained at `config.planning_speed`.
+    With `config.updates`, its Feasibility-Net is fitted anew before; with `config.agree_under`, its
+    f is scaled. Raises `ConfigError` if it was never trained at `config.planning_speed`, or its
+    robot cannot be disturbed.
     """
     if config.planning_speed:
         slowest, fastest = speeds_trained_with(specialist)
@@ -235,12 +241,18 @@ def calibrated(specialist: Specialist, config: CalibrateConfig) -> Specialist:
             feasibility=refitted(specialist, met_in_training(specialist, config), config),
         )
     tiles = own_terrain(specialist, config.envs, 2 * (config.seed * 10_000 + HELD_OUT) + 1)
-    held_out = roll_out(specialist, tiles, config.envs, config.seconds, seed=config.seed)
+    presets = [condition_of(specialist.robot, name).options for name in config.agree_under]
+    held_out, *drives = (
+        roll_out(specialist, tiles, config.envs, config.seconds, seed=config.seed, options=options)
+        for options in (None, *presets)
+    )
+    if drives:
+        specialist = replace(specialist, feasibility=scaled(specialist.feasibility, drives))
     quantiles, strangeness = quantiles_on(specialist.feasibility, held_out.distinctive)
     note = {
         "calibration": {
             "patches": len(held_out.distinctive),
-            **{name: getattr(config, name) for name in ("envs", "seconds", "seed")},
+            **{name: getattr(config, name) for name in ("envs", "seconds", "seed", "agree_under")},
         }
     }
     if config.updates:

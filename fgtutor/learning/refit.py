@@ -2,17 +2,19 @@
 
 Reads what the policy met in training; gives a net whose autoencoder is fitted to it (Eq. 3), and
 whose head is the old one, or a smaller one that repeats the old one's f anywhere (distillation).
-Source: paper, Sec. III-A; the refit is ours.
+Or one whose f is scaled until it agrees with the r_v that the finished policy reached.
+Source: paper, Sec. III-A; the refit is ours; the scaling is Platt's (1999).
 """
 
+import copy
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy import ndimage
+from scipy import ndimage, optimize, special
 from torch import Tensor, nn
 
 from fgtutor import patches
@@ -20,6 +22,7 @@ from fgtutor.elevation import ElevationMap
 from fgtutor.feasibility import FeasibilityNet
 from fgtutor.io.progress import watch
 from fgtutor.robots import ROBOTS, env_class
+from fgtutor.settings import PlanSettings
 from fgtutor.specialist import Specialist
 from fgtutor.world.terrain import make_terrain
 
@@ -103,6 +106,31 @@ def fit_head(
         return torch.cat(errors).square().mean()
 
     _fit(net, net.head.parameters(), updates, loss, "fitting f", seed)
+
+
+@torch.no_grad()
+def scaled(net: FeasibilityNet, drives: Sequence["Rollout"]) -> FeasibilityNet:
+    """Return the net with an f that agrees with the r_v that followed.
+
+    The logit of f is stretched about that of `f_min`, by a factor fitted to all labels of the
+    drives in squared error: a step is feasible to the new net if it was to the old one, and what is
+    more feasible stays so. Source: Platt (1999), who shifts the logit as well.
+    """
+    f = torch.cat([net.feasibility(one.patch, one.command) for one in drives])
+    pivot = special.logit(PlanSettings().f_min)
+    (factor,), _ = optimize.curve_fit(
+        lambda beyond, factor: special.expit(pivot + factor * beyond),
+        f.logit(eps=1e-6).numpy() - pivot,
+        torch.cat([one.label for one in drives]).numpy(),
+        p0=1.0,
+        bounds=(0.0, np.inf),
+    )
+    net = copy.deepcopy(net)
+    weight, bias = list(net.head.parameters())[-2:]
+    weight *= factor
+    bias *= factor
+    bias += (1 - factor) * pivot
+    return net
 
 
 def any_ground(specialist: Specialist, easiest: float, seed: int = 0) -> Float[Tensor, "n points"]:
