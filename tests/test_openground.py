@@ -12,6 +12,7 @@ from fgtutor.__main__ import main
 from fgtutor.baselines import Classical
 from fgtutor.elevation import ElevationMap
 from fgtutor.errors import ConfigError, TerrainError
+from fgtutor.evaluation import openground, trials
 from fgtutor.evaluation.openground import OpenGroundConfig, shortest_ways, ways
 from fgtutor.evaluation.openground_tables import OpenRow, failed_where, table
 from fgtutor.figures.maps import draw_elevation
@@ -183,6 +184,25 @@ def test_the_command_plans_drives_and_reports(tmp_path, capsys):
     assert all((row["outcome"] == "no_route") == (row["promise"] is None) for row in rows)
     assert (tmp_path / "figures" / "map-00000.png").exists()
     assert "recall" in capsys.readouterr().out
+
+
+def test_refused_tasks_are_drawn_without_planning_them_again(tmp_path, monkeypatch):
+    config = OpenGroundConfig(robot="toy", maps=1, tasks=3)
+    starts = []
+
+    def plan_all(planner, grounds, *rest):
+        starts.extend(ground.terrain.start for ground in grounds)
+        return trials.plan_all(planner, grounds, *rest)
+
+    monkeypatch.setattr(openground, "plan_all", plan_all)
+    rows: list[Any] = [
+        {"task": task, "outcome": outcome, "feasible": True}
+        for task, outcome in enumerate(("no_route", "reached", "no_route"))
+    ]
+    openground.picture(config, 0, rows)(tmp_path / "map.png")
+    assert starts == [openground.make_ground(config, 0).tasks[1].start]
+    openground.picture(config, 0, [rows[0]])(tmp_path / "refused.png")
+    assert len(starts) == 1 and (tmp_path / "refused.png").exists()
 
 
 def test_the_shipped_map_of_real_stairs_is_read():

@@ -227,6 +227,7 @@ def calibrated(specialist: Specialist, config: CalibrateConfig) -> Specialist:
     f is scaled. Raises `ConfigError` if it was never trained at `config.planning_speed`, or its
     robot cannot be disturbed.
     """
+    presets = [condition_of(specialist.robot, name).options for name in config.agree_under]
     if config.planning_speed:
         slowest, fastest = speeds_trained_with(specialist)
         if not slowest <= config.planning_speed <= fastest:
@@ -241,7 +242,6 @@ def calibrated(specialist: Specialist, config: CalibrateConfig) -> Specialist:
             feasibility=refitted(specialist, met_in_training(specialist, config), config),
         )
     tiles = own_terrain(specialist, config.envs, 2 * (config.seed * 10_000 + HELD_OUT) + 1)
-    presets = [condition_of(specialist.robot, name).options for name in config.agree_under]
     held_out, *drives = (
         roll_out(specialist, tiles, config.envs, config.seconds, seed=config.seed, options=options)
         for options in (None, *presets)
