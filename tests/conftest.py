@@ -1,4 +1,4 @@
-"""What every test starts from: one thread, no window, and a small specialist made on the spot."""
+"""What every test starts from: one thread, one seed, no window, and a small specialist."""
 
 import gc
 import math
@@ -34,6 +34,12 @@ settings.load_profile("house")
 def pytest_collection_finish() -> None:
     """Let no garbage collection look at what was imported: trainings collect at each checkpoint."""
     gc.freeze()
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    """Draw the same numbers in each test, whatever ran before it on the same worker."""
+    torch.manual_seed(1)
 
 
 @pytest.fixture(scope="session")

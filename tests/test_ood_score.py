@@ -146,7 +146,8 @@ def test_scaling_finds_the_factor_and_keeps_what_is_feasible():
         label = torch.sigmoid(pivot + 1.3 * (said.logit() - pivot))
         drive = Rollout(patch, command, label)
         f = refit.scaled(net, [drive, drive]).feasibility(patch, command)
-        askew = refit.scaled(net, [Rollout(patch, command, 1 - label)])
+        mirrored = torch.sigmoid(2 * pivot - said.logit())  # the higher f, the lower r_v
+        askew = refit.scaled(net, [Rollout(patch, command, mirrored)])
         reverse = askew.feasibility(patch, command)
     assert 0.1 < (said < 0.1).float().mean() < 0.9
     torch.testing.assert_close(f, label, atol=1e-3, rtol=0)
