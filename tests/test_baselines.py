@@ -267,12 +267,12 @@ def test_finer_headings_are_tried_where_the_others_find_no_route(known):
         """The same, and a chance along the axes."""
         tensor = askew(ground)[0]["steps"]
         along = (Headings(ground.headings).steps == 0).any(axis=-1)
-        tensor[..., along] = 0.25
+        tensor[..., along] = 0.2
         return [{"steps": tensor}]
 
     # Along the eight a route promises 0.4; along the 48 nearly 1, and that one is taken.
     coarse = find_route(doubtful, known, *ends, finer_headings=8)
-    assert coarse.promise == pytest.approx(math.exp(-0.9 * math.exp(HAZARD - RELIEF * 0.25)))
+    assert coarse.promise == pytest.approx(math.exp(-0.9 * math.exp(HAZARD - RELIEF * 0.2)))
     assert 0.25 < coarse.promise < SURE
     assert find_route(doubtful, known, *ends).num_headings == 48
     # Where none is surer, or any will do, the first one stands.
@@ -280,7 +280,7 @@ def test_finer_headings_are_tried_where_the_others_find_no_route(known):
     assert find_route(doubtful, known, *ends, **brave).num_headings == 8
 
     def level(ground):
-        return [{"steps": torch.full((*ground.elevation.shape, ground.headings), 0.25)}]
+        return [{"steps": torch.full((*ground.elevation.shape, ground.headings), 0.2)}]
 
     level_route = find_route(level, known, (0.15, 0.25), (0.95, 0.25))
     assert 0.25 < level_route.promise < SURE and level_route.num_headings == 8

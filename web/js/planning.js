@@ -33,7 +33,7 @@ export const PAPER = {
 };
 
 /** Walks that end per metre are exp(HAZARD - RELIEF F); fitted to drives of the A1. */
-const [HAZARD, RELIEF] = [4, 16];
+const [HAZARD, RELIEF] = [4, 20];
 /** By how much the least F of a step is raised to find a route that promises more. */
 const RAISE = 0.05;
 
